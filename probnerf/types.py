@@ -1,0 +1,105 @@
+"""The arrays that flow through `probnerf`. Everything here lives in the unit cube of the *view frame*.
+
+View frame: gravity-aligned (z up), origin at the cube's centre, +x pointing horizontally from the object to the camera,
+one unit = `half_extent` metres of the ObjectFrame. The support plane is z = BASE_Z. Metres and pixels stop at `perception`.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+# Height of the support plane in the cube, in the view frame and in the canonical object frame alike.
+BASE_Z = -0.75
+
+# Pixel statuses of an Observation (SCIENCE: object / free / unknown).
+UNKNOWN, OBJECT, FREE = 0, 1, 2
+
+
+class Rays(eqx.Module):
+    """Camera rays in the view frame, in cube units."""
+
+    origin: Float[Array, "n 3"]
+    direction: Float[Array, "n 3"]  # unit vectors
+
+
+class Observation(eqx.Module):
+    """What N pixels of one view say about one object (view frame, cube units).
+
+    Rays `[0, colour_count)` may be OBJECT pixels and carry colour; later ones never do, so the colour network skips them.
+    A padding ray has status UNKNOWN and limit 0: it says nothing.
+    """
+
+    rays: Rays
+    status: Int[Array, "n"]  # UNKNOWN, OBJECT or FREE
+    rgb: Float[Array, "n 3"]  # in [0, 1]
+    rgb_valid: Bool[Array, "n"]
+    range: Float[Array, "n"]  # measured distance along the ray; only read where range_valid (OBJECT pixels)
+    range_sigma: Float[Array, "n"]  # standard deviation of `range`
+    range_valid: Bool[Array, "n"]
+    limit: Float[Array, "n"]  # FREE and UNKNOWN: the ray was seen to be empty of the object up to here (0: says nothing)
+    pose_sigma: Float[Array, "3"]  # prior standard deviations of x, y (cube units) and log-scale of the pose
+    colour_count: int = eqx.field(static=True)
+
+    def __check_init__(self) -> None:
+        if self.colour_count > self.status.shape[0]:
+            raise ValueError(f"colour_count {self.colour_count} exceeds the {self.status.shape[0]} rays")
+
+
+class Pose(eqx.Module):
+    """Where the canonical object stands in the view frame: p_view = R_z(yaw) scale (p_object - base) + base + (x, y, 0).
+
+    `base` is (0, 0, BASE_Z), so that the object stays on its plane. Leaves may carry leading batch axes.
+    """
+
+    yaw: Float[Array, "..."]  # radians, counter-clockwise about z
+    x: Float[Array, "..."]  # cube units
+    y: Float[Array, "..."]  # cube units
+    log_scale: Float[Array, "..."]
+
+    def to_object(self, points: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+        """View-frame points in the canonical object frame (the lattice stands still, the field moves)."""
+        c, s = jnp.cos(self.yaw), jnp.sin(self.yaw)
+        inverse_scale = jnp.exp(-self.log_scale)
+        u = points[..., 0] - self.x
+        v = points[..., 1] - self.y
+        w = points[..., 2] - BASE_Z
+        return jnp.stack(
+            [inverse_scale * (c * u + s * v), inverse_scale * (-s * u + c * v), inverse_scale * w + BASE_Z], axis=-1
+        )
+
+    def to_object_direction(self, directions: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+        """View-frame unit directions in the canonical object frame."""
+        c, s = jnp.cos(self.yaw), jnp.sin(self.yaw)
+        u, v = directions[..., 0], directions[..., 1]
+        return jnp.stack([c * u + s * v, -s * u + c * v, directions[..., 2] * jnp.ones_like(c)], axis=-1)
+
+
+def identity_pose() -> Pose:
+    """The pose of an object that stands canonically in the cube."""
+    zero = jnp.zeros(())
+    return Pose(yaw=zero, x=zero, y=zero, log_scale=zero)
+
+
+class Diagnostics(eqx.Module):
+    """What a sampler says of itself; trouble is a result that travels with the posterior."""
+
+    acceptance: Float[Array, ""]  # mean Metropolis acceptance over the last stage
+    divergences: Int[Array, ""]  # trajectories whose energy error exceeded 1,000 nats or was not finite
+    r_hat: Float[Array, ""]  # split R-hat of the log-likelihood over chains or populations (NaN where undefined)
+    ess: Float[Array, ""]  # effective sample size of the final weights
+    ancestors: Int[Array, ""]  # distinct initial particles that survive
+    stages: Int[Array, ""]
+    point_gradients: Float[Array, ""]  # field evaluations with gradient
+
+
+class Posterior(eqx.Module):
+    """Weighted samples. Position vectors are [z | pose a, b, x, y, log-scale | delta], each a priori N(0, 1)."""
+
+    positions: Float[Array, "s d"]
+    log_weights: Float[Array, "s"]  # normalised: logsumexp is 0
+    log_likelihoods: Float[Array, "s"]
+    population: Int[Array, "s"]  # independent population (or chain) of each sample: the source of Monte Carlo error
+    log_evidence: Float[Array, ""]  # mean over populations, NaN for samplers that have none
+    log_evidence_se: Float[Array, ""]
+    diagnostics: Diagnostics
+    result: str = eqx.field(static=True)  # why it stopped: "converged", "budget", "stages", "interrupted"
