@@ -1,0 +1,69 @@
+"""Laws of the camera: rays and projection are inverse; what is no camera is refused."""
+
+import numpy as np
+import pytest
+
+from calibration.camera import Camera
+
+K = np.array([[520.0, 0.0, 318.5], [0.0, 518.0, 243.2], [0.0, 0.0, 1.0]])
+LENSES = {
+    "none": ("plumb_bob", np.zeros(5)),
+    "plumb_bob": ("plumb_bob", np.array([-0.28, 0.07, 0.0006, -0.0003, 0.01])),
+    "four": ("plumb_bob", np.array([0.1, -0.2, 0.001, 0.001])),
+    "rational": ("rational_polynomial", np.array([8.6, 4.6, 1e-4, -6e-5, 0.25, 8.9, 7.5, 1.3])),
+}
+
+
+def camera(lens: str = "none") -> Camera:
+    model, distortion = LENSES[lens]
+    return Camera(640, 480, K, distortion, model)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_project_inverts_rays(lens: str) -> None:
+    x, y = np.meshgrid(np.linspace(0, 639, 17), np.linspace(0, 479, 13))
+    pixels = np.column_stack([x.ravel(), y.ravel()])
+    rays = camera(lens).rays(pixels)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=1e-12)
+    depth = np.random.default_rng(0).uniform(0.3, 4.0, (len(rays), 1))
+    np.testing.assert_allclose(camera(lens).project(rays * depth), pixels, atol=1e-3)
+
+
+def test_the_axis_looks_forward_and_y_is_down() -> None:
+    rays = camera().rays(np.array([[318.5, 243.2], [318.5, 400.0], [500.0, 243.2]]))
+    np.testing.assert_allclose(rays[0], [0, 0, 1], atol=1e-12)
+    assert rays[1, 1] > 0 and rays[2, 0] > 0
+
+
+def test_points_behind_the_camera_have_no_pixel() -> None:
+    for lens in LENSES:
+        assert np.isnan(camera(lens).project(np.array([[0.1, 0.0, -1.0], [0.0, 0.0, 0.0]]))).all()
+
+
+def test_a_pixel_that_no_ray_reaches_is_nan() -> None:
+    barrel = Camera(640, 480, K, np.array([-0.9, 0.0, 0.0, 0.0, 0.0]))  # folds over inside the picture
+    rays = barrel.rays(np.array([[0.0, 0.0], [318.5, 243.2]]))
+    assert np.isnan(rays[0]).all() and np.isfinite(rays[1]).all()
+
+
+def test_empty_arrays_pass() -> None:
+    assert camera().rays(np.zeros((0, 2))).shape == (0, 3)
+    assert camera().project(np.zeros((0, 3))).shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"width": 0}, "0x480"),
+        ({"K": np.full((3, 3), np.nan)}, "finite"),
+        ({"K": np.diag([-500.0, 500.0, 1.0])}, "positive focal"),
+        ({"K": K.T}, "transposed"),
+        ({"model": "equidistant"}, "equidistant"),
+        ({"distortion": np.zeros(3)}, "4 or 5"),
+        ({"distortion": np.full(5, np.inf)}, "finite"),
+    ],
+)
+def test_what_is_no_camera_is_refused(change: dict, says: str) -> None:
+    fields = {"width": 640, "height": 480, "K": K, "distortion": np.zeros(5), "model": "plumb_bob"} | change
+    with pytest.raises(ValueError, match=says):
+        Camera(**fields)
