@@ -1,8 +1,9 @@
 """The tabletop family: vessels and cartons with exact truth, drawn from a seed.
 
 Canonical frame (cube units): z up, the body's axis at x = y = 0, the base on z = BASE_Z, the handle (or a carton's
-front face) at +x, a spout at -x. The larger of the body's longest horizontal side and its height is BODY_EXTENT; handles and
-spouts are not part of the body. The object stands in the cube after a small similarity about its support point (slack).
+front face) at +x, a spout at -x. The larger of the body's longest horizontal side and its height is BODY_EXTENT;
+handles and spouts are not part of the body. The object stands in the cube after a small similarity about its support
+point (slack).
 
 Symbols: (r, z) are cylindrical coordinates; s in [0, 1] is the height as a fraction of the body's.
 """
@@ -138,12 +139,17 @@ def _spout_distance(spout: Float[Array, "2 3"], x: Array, y: Array, z: Array) ->
     )
 
 
+def canonical_parts(obj: TabletopObject, x: Array, y: Array, z: Array) -> tuple[Array, Array]:
+    """Distances of canonical coordinates (before slack) to carton or spout and to the handle; -_ABSENT if absent."""
+    box = jnp.where(obj.kind == CARTON, _box_distance(obj.box, x, y, z), -_ABSENT)
+    return jnp.minimum(box, _spout_distance(obj.spout, x, y, z)), _tube_distance(obj.tube, obj.tube_section, x, y, z)
+
+
 def canonical_distances(obj: TabletopObject, x: Array, y: Array, z: Array) -> tuple[Array, Array]:
-    """Body (spout included) and handle distances of canonical coordinates (before slack), of equal shape."""
-    r = jnp.sqrt(x * x + y * y)
-    body = jnp.where(obj.kind == CARTON, _box_distance(obj.box, x, y, z), _outline_distance(obj.outline, r, z))
-    body = jnp.minimum(body, _spout_distance(obj.spout, x, y, z))
-    return body, _tube_distance(obj.tube, obj.tube_section, x, y, z)
+    """Body (spout included) and handle distances of canonical coordinates."""
+    rest, handle = canonical_parts(obj, x, y, z)
+    revolved = _outline_distance(obj.outline, jnp.sqrt(x * x + y * y), z)
+    return jnp.minimum(rest, jnp.where(obj.kind == CARTON, -_ABSENT, revolved)), handle
 
 
 def to_canonical(obj: TabletopObject, points: Float[Array, "... 3"]) -> tuple[Array, Array, Array]:
@@ -169,8 +175,9 @@ def part_distances(
 def signed_distance(obj: TabletopObject, points: Float[Array, "... 3"]) -> Float[Array, "..."]:
     """Signed distance (cube units) of points in the cube to ONE object: negative inside.
 
-    The minimum over the parts' exact distances: exact outside, and its sign is exact everywhere. Inside, it is exact where
-    the nearest surface of the deepest part is a surface of the whole; where parts overlap its magnitude is a lower bound.
+    The minimum over the parts' exact distances: exact outside, and its sign is exact everywhere. Inside, it is exact
+    where the deepest part's nearest surface is not covered by another part; where parts overlap its magnitude is a
+    lower bound.
     """
     body, handle = part_distances(obj, points)
     return jnp.minimum(body, handle)
@@ -183,6 +190,17 @@ def colour(obj: TabletopObject, points: Float[Array, "... 3"], normals: Float[Ar
     """Lit colour in [0, 1] of surface points with unit normals: Lambert plus ambient, the light fixed to the object."""
     x, y, z = to_canonical(obj, points)
     body, handle = canonical_distances(obj, x, y, z)
+    return canonical_colour(obj, (x, y, z), normals, handle < body)
+
+
+def canonical_colour(
+    obj: TabletopObject,
+    points: tuple[Array, Array, Array],
+    normals: Float[Array, "... 3"],
+    on_handle: Bool[Array, "..."],
+) -> Float[Array, "... 3"]:
+    """`colour` of canonical coordinates x, y, z."""
+    x, y, z = points
     r = jnp.sqrt(x * x + y * y)
     nx, ny, nz = normals[..., 0], normals[..., 1], normals[..., 2]
     carton = obj.kind == CARTON
@@ -212,7 +230,7 @@ def colour(obj: TabletopObject, points: Float[Array, "... 3"], normals: Float[Ar
     paint = choose(s > obj.lid_start, obj.paint[4], paint)
     inward = (nx * x + ny * y < -0.1 * r) | ((nz > 0.5) & (s < 0.6))  # the cavity's wall or floor
     paint = choose(obj.is_open & inward, obj.paint[6], paint)
-    paint = choose(handle < body, obj.paint[5], paint)
+    paint = choose(on_handle, obj.paint[5], paint)
     facing = jnp.maximum(jnp.sum(normals * obj.light, axis=-1), 0.0)
     return jnp.clip(paint * (obj.ambient + obj.lamp * facing[..., None]), 0.0, 1.0)
 
@@ -305,7 +323,7 @@ def _handle(
     along = np.linspace(0.0, 1.0, _TUBE)
     wall_x = np.maximum((1 - along) * ends[0] + along * ends[1], np.interp(line_z, z, radius))
     # The ends' balls meet the wall without showing in the cavity.
-    line_x = wall_x + max(tube - wall, 0.0) - 0.01 + (reach - tube) * out / out.max()
+    line_x = wall_x + max(tube - wall, 0.0) + 0.01 + (reach - tube) * out / out.max()
     line_x = np.minimum(line_x, REACH_LIMIT - tube)
     return np.stack([line_x, line_z], axis=-1), tube, across
 
@@ -396,7 +414,7 @@ def _vessel(rng: np.random.Generator, kind: int) -> dict[str, np.ndarray | float
     if kind == PITCHER and rng.uniform() < 0.7:
         thick, thin = rng.uniform(0.1, 0.16), rng.uniform(0.05, 0.08)
         foot = z[-1] - thick - height * rng.uniform(0.0, 0.12)
-        x = np.interp(foot, z, radius) + max(thick - thickness, 0.0) - 0.01
+        x = np.interp(foot, z, radius) + max(thick - thickness, 0.0) + 0.01
         tip_x = x + rng.uniform(0.1, 0.22)
         tip_z = min(foot + rng.uniform(0.08, 0.25), z[-1] + 0.05)
         shape["spout"] = np.array([[-x, foot, thick], [-tip_x, tip_z, thin]])
