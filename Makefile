@@ -1,0 +1,56 @@
+# `make run` and `make test` need only make and Python 3.11 or newer: they set up .venv, from the lock, by themselves.
+
+PYTHON ?= $(shell for p in python3.11 python3 python3.12 python3.13; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+BIN := .venv/bin
+ARGS ?=
+
+.PHONY: help setup run test slow format lock clean
+
+help:
+	@echo 'make run     set up if needed, then replay the recording that ships with the project (ARGS=... adds options)'
+	@echo 'make test    set up if needed, then lint, format check, types and the default tests'
+	@echo 'make slow    the statistical tests of minutes'
+	@echo 'make format  sort imports and format every file'
+	@echo 'make lock    write requirements.lock again (ARGS=--upgrade moves every version)'
+	@echo 'make clean   remove .venv and all caches'
+
+run: setup
+	$(BIN)/farside replay $(ARGS)
+
+test: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/pytest $(ARGS)
+
+# pytest answers 5 where no test is marked slow.
+slow: setup
+	$(BIN)/pytest -m slow $(ARGS) || [ $$? -eq 5 ]
+
+format: setup
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# Versions already locked stay unless pyproject.toml or ARGS says otherwise.
+lock: setup
+	$(BIN)/uv pip compile pyproject.toml --extra dev --python-version 3.11 --universal --fork-strategy fewest \
+		--generate-hashes --custom-compile-command 'make lock' --quiet --output-file requirements.lock $(ARGS)
+
+clean:
+	rm -rf .venv .jax_cache .mypy_cache .pytest_cache .ruff_cache *.egg-info
+
+setup: .venv/.installed
+
+# The stamps are written last, so a set-up that was cut short is taken up again.
+.venv/.locked: requirements.lock
+	@[ -n "$(PYTHON)" ] || { echo 'farside needs Python 3.11 or newer on PATH; found none.' \
+		'Install it, or name it: make PYTHON=/path/to/python3.11' >&2; exit 1; }
+	@echo 'Setting up .venv from requirements.lock: 1.5 GB, a minute or a few'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --require-hashes --requirement requirements.lock
+	@touch $@
+
+.venv/.installed: .venv/.locked pyproject.toml
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
