@@ -1,0 +1,243 @@
+"""The folders are the architecture: who may import whom, one importing file per outside library, and the house rules.
+
+Each rule is a function from a file's path and syntax tree to complaints, so the rules themselves are tested at the end.
+"""
+
+import ast
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from fnmatch import fnmatch
+from functools import cache
+from importlib.metadata import packages_distributions
+from pathlib import Path, PurePosixPath
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+MAX_LINES = 350
+
+# The diamond: a folder of ours and the folders of ours that it may import besides itself.
+MAY_IMPORT: dict[str, set[str]] = {
+    "calibration": set(),
+    "probnerf": set(),
+    "perception": {"calibration", "probnerf"},
+    "node": {"calibration", "probnerf", "perception", "benchmarks"},
+    "benchmarks": {"calibration", "probnerf", "perception", "node"},
+}
+PACKAGES = ("calibration", "probnerf", "perception", "node")  # installed; `benchmarks` runs from a checkout
+
+# An outside library and the files that may import it: one per purpose. `*` also matches folders; tests import freely.
+IMPORTERS: dict[str, tuple[str, ...]] = {
+    "numpy": ("*",),
+    "jaxtyping": ("*",),
+    # JAX is probnerf's; perception meets it only where arrays are handed over.
+    "jax": ("probnerf/*", "perception/observe.py", "perception/controller.py", "benchmarks/*"),
+    "equinox": ("probnerf/*", "benchmarks/*"),
+    "optax": ("probnerf/train.py", "probnerf/variational.py", "probnerf/baselines/*"),
+    "safetensors": ("probnerf/model.py",),
+    "blackjax": (),  # an independent sampler to test against
+    "cv2": ("calibration/*", "perception/*"),
+    "scipy": ("probnerf/occupancy.py", "probnerf/metrics.py", "perception/*", "benchmarks/*"),
+    "skimage": ("probnerf/occupancy.py", "perception/*"),
+    "serial": ("calibration/turntable.py",),
+    "depthai": ("perception/oak.py",),
+    "rosbags": ("perception/log.py", "node/message.py"),  # recorded logs; messages on the bus
+    "mcap": ("perception/log.py",),
+    "yaml": ("calibration/camera.py", "node/config.py"),  # camera files; launch files
+    "zenoh": ("node/bus.py",),
+    "viser": ("node/page.py",),
+    "tyro": ("node/__main__.py", "benchmarks/*"),
+    "rich": ("node/*", "benchmarks/*"),
+    "matplotlib": ("node/plot.py", "benchmarks/*"),
+}
+
+CAN_EXECUTE_CODE = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve"}
+Rule = Callable[[PurePosixPath, ast.Module], Iterator[str]]
+
+
+def imports(path: PurePosixPath, tree: ast.AST) -> Iterator[str]:
+    """Top-level names of all modules that a file imports, inside functions and relative or by name, too."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.Import(names=names):
+                yield from (name.name.split(".")[0] for name in names)
+            case ast.ImportFrom(module=module, level=0) if module:
+                yield module.split(".")[0]
+            case ast.ImportFrom(module=module, names=names, level=level):
+                inside = path.parts[: -level or None]
+                yield inside[0] if inside else (module or names[0].name).split(".")[0]
+            case ast.Call(
+                func=ast.Name(id="__import__") | ast.Attribute(attr="import_module") | ast.Name(id="import_module"),
+                args=[ast.Constant(value=str(name)), *_],
+            ):
+                yield name.split(".")[0]
+
+
+def breaks_diamond(path: PurePosixPath, tree: ast.Module) -> Iterator[str]:
+    folder = path.parts[0]
+    for other in sorted(set(imports(path, tree)) & {*MAY_IMPORT, "tests", "launch"} - {folder} - MAY_IMPORT[folder]):
+        yield f"{path} imports {other}, which {folder} must not know"
+
+
+def breaks_importer_rule(path: PurePosixPath, tree: ast.Module) -> Iterator[str]:
+    ours = {*MAY_IMPORT, "tests", "launch"}
+    for library in sorted(set(imports(path, tree)) - ours - sys.stdlib_module_names):
+        allowed = IMPORTERS.get(library)
+        if allowed is None:
+            yield f"{path} imports {library}, which is not in the table of outside libraries (IMPORTERS)"
+        elif not any(fnmatch(str(path), pattern) for pattern in allowed):
+            yield f"{path} imports {library}, which only {', '.join(allowed) or 'tests'} may import"
+
+
+def can_execute_code(path: PurePosixPath, tree: ast.Module) -> Iterator[str]:
+    for module in sorted(set(imports(path, tree)) & CAN_EXECUTE_CODE):
+        yield f"{path} imports {module}: a file that it reads could execute code"
+    for node in ast.walk(tree):
+        if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
+            if not (isinstance(node.value, ast.Constant) and node.value.value is False):
+                yield f"{path}:{node.value.lineno} passes allow_pickle: a file that it reads could execute code"
+
+
+def has_global_state(path: PurePosixPath, tree: ast.Module) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Global):
+            yield f"{path}:{node.lineno} rebinds the module's {', '.join(node.names)}: pass it as an argument"
+
+
+def has_vague_name(path: PurePosixPath, tree: ast.Module) -> Iterator[str]:
+    for part in {path.stem, *path.parts[:-1]} & {"util", "utils", "helper", "helpers", "misc", "common"}:
+        yield f"{path}: `{part}` says nothing; name the concept"
+
+
+def has_untyped_signature(path: PurePosixPath, tree: ast.Module) -> Iterator[str]:
+    """Public functions and methods; what is private or local may leave its types to inference."""
+    scopes: list[ast.Module | ast.ClassDef] = [tree, *(node for node in tree.body if isinstance(node, ast.ClassDef))]
+    for f in (node for scope in scopes for node in scope.body):
+        if not isinstance(f, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        initialiser = f.name == "__init__"
+        if f.name.startswith("_") and not initialiser:
+            continue
+        arguments = [*f.args.posonlyargs, *f.args.args, *f.args.kwonlyargs]
+        bare = [a.arg for a in arguments if a.annotation is None and a.arg not in ("self", "cls")]
+        if bare or (f.returns is None and not initialiser):
+            yield f"{path}:{f.lineno} {f.name}: no type for {', '.join(bare) or 'what it returns'}"
+
+
+RULES = (
+    breaks_diamond,
+    breaks_importer_rule,
+    can_execute_code,
+    has_global_state,
+    has_vague_name,
+    has_untyped_signature,
+)
+
+
+def files_of(*folders: str) -> list[PurePosixPath]:
+    found = (path for folder in folders for path in (ROOT / folder).rglob("*.py"))
+    return sorted(PurePosixPath(path.relative_to(ROOT).as_posix()) for path in found)
+
+
+@cache
+def tree_of(path: PurePosixPath) -> ast.Module:
+    return ast.parse((ROOT / path).read_text(encoding="utf-8"), str(path))
+
+
+@cache
+def project() -> dict:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
+def test_no_file(rule: Rule) -> None:
+    complaints = [line for path in files_of(*MAY_IMPORT) for line in rule(path, tree_of(path))]
+    assert not complaints, "\n" + "\n".join(complaints)
+
+
+def test_no_file_is_long() -> None:
+    lengths = {
+        path: len((ROOT / path).read_text(encoding="utf-8").splitlines()) for path in files_of(*MAY_IMPORT, "tests")
+    }
+    long = [f"{path} has {length} lines" for path, length in lengths.items() if length > MAX_LINES]
+    assert not long, f"\nat most {MAX_LINES} lines; a longer file has found a second concept\n" + "\n".join(long)
+
+
+def test_installed_packages_are_those_that_exist() -> None:
+    found = {str(path.parent).replace("/", ".") for path in files_of(*PACKAGES)}
+    with_init = {str(path.parent).replace("/", ".") for path in files_of(*PACKAGES) if path.name == "__init__.py"}
+    assert found == with_init, "a folder of Python files has no __init__.py"
+    assert sorted(project()["tool"]["setuptools"]["packages"]) == sorted(with_init)
+
+
+def test_every_imported_library_is_declared() -> None:
+    """Exactly: what packages import is a dependency, what tests import is one of the `dev` extra at least."""
+
+    def names(requirements: list[str]) -> set[str]:
+        return {r.split(">")[0].split("=")[0].split("<")[0].lower().replace("_", "-") for r in requirements}
+
+    runtime = names(project()["project"]["dependencies"])
+    developer = runtime | names(project()["project"]["optional-dependencies"]["dev"])
+    distributions = packages_distributions()
+    undeclared = []
+    for folders, declared in ((tuple(MAY_IMPORT), runtime), (("tests",), developer)):
+        for path in files_of(*folders):
+            outside = set(imports(path, tree_of(path))) - sys.stdlib_module_names - {*MAY_IMPORT, "tests"}
+            for library in sorted(outside):
+                providers = {name.lower().replace("_", "-") for name in distributions.get(library, [library])}
+                if not providers & declared:
+                    undeclared.append(f"{path} imports {library}, which pyproject.toml does not declare")
+    assert not undeclared, "\n" + "\n".join(undeclared)
+
+
+def test_launch_holds_no_python_package() -> None:
+    """A ROS package is named `launch`: ours must never be importable."""
+    for path in (ROOT / "launch").rglob("*"):
+        if path.is_file() and "__pycache__" not in path.parts and "farside_msgs" not in path.parts:
+            assert path.name.endswith((".yaml", ".launch.py")), f"{path.relative_to(ROOT)} does not belong in launch/"
+        assert path.name != "__init__.py", f"{path.relative_to(ROOT)} makes launch/ importable"
+
+
+@pytest.mark.parametrize(
+    ("rule", "path", "source", "said"),
+    [
+        (breaks_diamond, "probnerf/a.py", "def f():\n    from calibration.camera import Camera", "imports calibration"),
+        (breaks_diamond, "perception/a.py", "from .. import node", "imports node"),
+        (breaks_diamond, "probnerf/families/a.py", "from ...node.bus import Bus", "imports node"),
+        (breaks_diamond, "calibration/a.py", "importlib.import_module('perception.source')", "imports perception"),
+        (
+            breaks_importer_rule,
+            "perception/a.py",
+            "import zenoh.ext",
+            "perception/a.py imports zenoh, which only node/bus.py",
+        ),
+        (
+            breaks_importer_rule,
+            "probnerf/a.py",
+            "import torch",
+            "probnerf/a.py imports torch, which is not in the table",
+        ),
+        (can_execute_code, "probnerf/a.py", "np.load(f, allow_pickle=True)", "a.py:1 passes allow_pickle"),
+        (can_execute_code, "probnerf/a.py", "import pickle", "imports pickle"),
+        (has_global_state, "probnerf/a.py", "def f():\n    global x", "a.py:2 rebinds the module's x"),
+        (has_vague_name, "node/utils.py", "", "`utils` says nothing"),
+        (has_untyped_signature, "node/a.py", "class A:\n    def f(self, x) -> int: ...", "a.py:2 f: no type for x"),
+    ],
+)
+def test_rule_finds(rule: Rule, path: str, source: str, said: str) -> None:
+    assert said in "".join(rule(PurePosixPath(path), ast.parse(source)))
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
+def test_rule_accepts(rule: Rule) -> None:
+    source = """
+from ..types import Pose
+from . import foam
+import jax.numpy as jnp, numpy as np, os.path
+def area(x: float, *, y: float = 1) -> float:
+    return _times(x, y)
+def _times(x, y): return x * y
+np.load("f", allow_pickle=False)
+"""
+    assert not list(rule(PurePosixPath("probnerf/families/a.py"), ast.parse(source)))
