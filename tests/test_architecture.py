@@ -4,6 +4,7 @@ Each rule is a function from a file's path and syntax tree to complaints, so the
 """
 
 import ast
+import re
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
@@ -171,24 +172,32 @@ def test_installed_packages_are_those_that_exist() -> None:
     assert sorted(project()["tool"]["setuptools"]["packages"]) == sorted(with_init)
 
 
+def names(requirements: list[str]) -> set[str]:
+    """Normalised names of the distributions that requirement lines ask for."""
+    return {re.split(r"[^\w.-]", line)[0].lower().replace("_", "-") for line in requirements}
+
+
 def test_every_imported_library_is_declared() -> None:
-    """Exactly: what packages import is a dependency, what tests import is one of the `dev` extra at least."""
-
-    def names(requirements: list[str]) -> set[str]:
-        return {r.split(">")[0].split("=")[0].split("<")[0].lower().replace("_", "-") for r in requirements}
-
+    """What a package imports is a dependency; what only a test imports is one of the `dev` extra."""
     runtime = names(project()["project"]["dependencies"])
     developer = runtime | names(project()["project"]["optional-dependencies"]["dev"])
     distributions = packages_distributions()
     undeclared = []
     for folders, declared in ((tuple(MAY_IMPORT), runtime), (("tests",), developer)):
         for path in files_of(*folders):
-            outside = set(imports(path, tree_of(path))) - sys.stdlib_module_names - {*MAY_IMPORT, "tests"}
-            for library in sorted(outside):
-                providers = {name.lower().replace("_", "-") for name in distributions.get(library, [library])}
-                if not providers & declared:
+            for library in sorted(set(imports(path, tree_of(path))) - sys.stdlib_module_names - {*MAY_IMPORT, "tests"}):
+                if not names(distributions.get(library, [library])) & declared:
                     undeclared.append(f"{path} imports {library}, which pyproject.toml does not declare")
     assert not undeclared, "\n" + "\n".join(undeclared)
+
+
+def test_lock_has_an_exact_version_of_all_that_is_declared() -> None:
+    lines = (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
+    entries = [line for line in lines if line and not line.startswith((" ", "#"))]
+    assert all(re.match(r"[\w.-]+==[\w.]+( ;.*)? \\$", entry) for entry in entries)  # and no option, no address
+    declared = project()["project"]["dependencies"] + project()["project"]["optional-dependencies"]["dev"]
+    missing = names(declared) - names(entries)
+    assert not missing, f"requirements.lock lacks {', '.join(sorted(missing))}: run `make lock`"
 
 
 def test_launch_holds_no_python_package() -> None:
