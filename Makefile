@@ -6,6 +6,7 @@ BIN := .venv/bin
 ARGS ?=
 
 .PHONY: help setup run test slow format lock clean
+.DEFAULT_GOAL := help
 
 help:
 	@echo 'make run     set up if needed, then replay the recording that ships with the project (ARGS=... adds options)'
@@ -13,6 +14,7 @@ help:
 	@echo 'make slow    the statistical tests of minutes'
 	@echo 'make format  sort imports and format every file'
 	@echo 'make lock    write requirements.lock again (ARGS=--upgrade moves every version)'
+	@echo 'make setup   only set up'
 	@echo 'make clean   remove .venv and all caches'
 
 run: setup
@@ -51,6 +53,7 @@ setup: .venv/.installed
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet --require-hashes --requirement requirements.lock
 	@touch $@
 
+# Editable; setuptools would warn of that on every new machine.
 .venv/.installed: .venv/.locked pyproject.toml
-	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation --editable .
+	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
