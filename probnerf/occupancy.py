@@ -25,12 +25,13 @@ def voxel_centres(grid: int) -> Float[np.ndarray, "G G G 3"]:
 def voxel_index(points: Float[ArrayLike, "... 3"], grid: int) -> Int[np.ndarray, "..."]:
     """Flat index (C order) of the voxel that holds each point (cube units); -1 for a point outside the cube."""
     points = np.asarray(points)
-    cell = np.floor((points + 1.0) * (0.5 * grid))
-    # A point on the cube's far faces belongs to the last voxel, as one on the near faces belongs to the first.
-    cell = np.where(points == 1.0, grid - 1, cell)
-    inside = np.all((cell >= 0) & (cell < grid), axis=-1)
-    i, j, k = np.moveaxis(np.where(inside[..., None], cell, 0).astype(np.int64), -1, 0)
-    return np.where(inside, (i * grid + j) * grid + k, -1)
+    inside, index = np.ones(points.shape[:-1], bool), np.zeros(points.shape[:-1], np.int64)
+    for axis in range(3):
+        p = points[..., axis]
+        inside &= (p >= -1.0) & (p <= 1.0)
+        # Clipped, so that a point on the cube's far faces belongs to the last voxel.
+        index = index * grid + np.clip(np.floor((p + 1.0) * (0.5 * grid)), 0, grid - 1).astype(np.int64)
+    return np.where(inside, index, -1)
 
 
 def wall_opacity(sigma: Float[ArrayLike, "..."], grid: int) -> Float[np.ndarray, "..."]:
