@@ -1,0 +1,210 @@
+"""log p(observation | position): what camera pixels say, and the position vector that samplers move (SCIENCE §1 to §3).
+
+A position is a flat vector [z~ (K) | a, b, x, y, log-scale (5, if the pose is unknown) | delta (D, if open)], each entry
+a priori N(0, 1), so the log prior is the same standard normal for every model and tempering is one multiply.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from probnerf import foam
+from probnerf.field import CylinderField, Field
+from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
+
+POSE_SIZE = 5
+
+
+class Model(Protocol):
+    """A prior over fields: the trained ProbNeRF or an analytic one."""
+
+    @property
+    def field(self) -> Field: ...
+    @property
+    def latent(self) -> int: ...
+    def decode(self, z_tilde: Float[Array, "k"]) -> Float[Array, "d"]: ...
+
+
+class CylinderModel(eqx.Module):
+    """The analytic prior: handle length = 0.2 + 0.4 Phi(z_0), radius = 0.45 exp(0.15 z_1)."""
+
+    field: CylinderField = eqx.field(static=True, default=CylinderField())
+
+    @property
+    def latent(self) -> int:
+        """Two: handle length and radius."""
+        return 2
+
+    def decode(self, z_tilde: Float[Array, "2"]) -> Float[Array, "2"]:
+        """(handle length, radius) in cube units."""
+        return jnp.stack([0.2 + 0.4 * jax.scipy.stats.norm.cdf(z_tilde[0]), 0.45 * jnp.exp(0.15 * z_tilde[1])])
+
+
+class Likelihood(eqx.Module):
+    """The pixel model's settings; they travel with every posterior."""
+
+    lattice: foam.Lattice
+    colour_sigma: float = eqx.field(static=True, default=0.1)  # s
+    mask_error: float = eqx.field(static=True, default=0.01)  # epsilon, each way
+    outlier: float = eqx.field(static=True, default=0.05)  # pi: depth from nowhere, uniform over `outlier_span`
+    outlier_span: float = eqx.field(static=True, default=2.5)  # cube units
+    wall_sigma: float = eqx.field(static=True, default=0.02)  # floor of the model's own wall error, cube units
+    power: float = eqx.field(static=True, default=1.0)  # kappa; other than 1 is a stated power likelihood
+    sample_pose: bool = eqx.field(static=True, default=True)
+    sample_delta: bool = eqx.field(static=True, default=False)
+    delta_scale: float = eqx.field(static=True, default=0.025)  # sqrt(alpha)
+
+    def dim(self, model: Model) -> int:
+        """Length of a position vector."""
+        weights = model.field.size if self.sample_delta else 0  # type: ignore[attr-defined]
+        return model.latent + POSE_SIZE * self.sample_pose + weights
+
+
+def pose_of(latent: Float[Array, "5"], pose_sigma: Float[Array, "3"]) -> Pose:
+    """yaw = atan2(b, a); x, y, log-scale are standard normals times perception's widths (SCIENCE §3)."""
+    a, b = latent[..., 0], latent[..., 1]
+    # atan2 has no gradient at the origin, a point of measure zero that float32 could still meet
+    at_origin = (a * a + b * b) < 1e-12
+    yaw = jnp.arctan2(b, jnp.where(at_origin, 1.0, a))
+    return Pose(
+        yaw=yaw, x=latent[..., 2] * pose_sigma[0], y=latent[..., 3] * pose_sigma[1], log_scale=latent[..., 4] * pose_sigma[2]
+    )
+
+
+def split_position(
+    model: Model, likelihood: Likelihood, position: Float[Array, "d"], pose_sigma: Float[Array, "3"]
+) -> tuple[Float[Array, "w"], Pose | None]:
+    """Field weights w~ and pose of one position."""
+    k = model.latent
+    weights = model.decode(position[:k])
+    pose = None
+    if likelihood.sample_pose:
+        pose = pose_of(position[k : k + POSE_SIZE], pose_sigma)
+    if likelihood.sample_delta:
+        weights = weights + likelihood.delta_scale * position[-weights.shape[0] :]  # w~ = w + sqrt(alpha) delta
+    return weights, pose
+
+
+def faces_of_view(observation: Observation, lattice: foam.Lattice) -> Float[Array, "n m"]:
+    """Crossings of every ray: constants of the observation, computed once per view."""
+    return foam.crossings(observation.rays, lattice)
+
+
+def log_likelihood_one(
+    model: Model,
+    likelihood: Likelihood,
+    observation: Observation,
+    t: Float[Array, "n m"],
+    position: Float[Array, "d"],
+) -> Float[Array, ""]:
+    """log p(observation | one position), summed over pixels."""
+    weights, pose = split_position(model, likelihood, position, observation.pose_sigma)
+    return likelihood.power * jnp.sum(pixel_terms(model.field, weights, pose, likelihood, observation, t))
+
+
+def pixel_terms(
+    field: Field,
+    weights: Float[Array, "w"],
+    pose: Pose | None,
+    likelihood: Likelihood,
+    observation: Observation,
+    t: Float[Array, "n m"],
+) -> Float[Array, "n"]:
+    """Each pixel's log density (SCIENCE §2): where its ray ends, is it the object, how far, which colour."""
+    n_colour = observation.colour_count
+    points = foam.points_on_rays(observation.rays, t)
+    scale = jnp.ones(())
+    if pose is not None:
+        points, scale = pose.to_object(points), jnp.exp(pose.log_scale)
+    sigma = field.density(weights, points) * foam.window(points)
+    faces = foam.composite(sigma, t, scale / likelihood.lattice.cubes)
+    log_miss = faces.log_transmittance[:, -1]
+    eps = likelihood.mask_error
+
+    # OBJECT: sum_i w_i p(m|hit) p(d|t_i) + T p(m|miss) p(d|miss)
+    t_hit, log_w = t[:n_colour], faces.log_weight[:n_colour]
+    deviation = jnp.sqrt(
+        observation.range_sigma[:n_colour, None] ** 2 + likelihood.wall_sigma**2 + foam.spacing(t_hit) ** 2 / 12.0
+    )
+    residual = (observation.range[:n_colour, None] - jnp.where(t_hit < foam.FAR, t_hit, 0.0)) / deviation
+    log_uniform = -jnp.log(likelihood.outlier_span)
+    log_depth = jnp.logaddexp(
+        jnp.log1p(-likelihood.outlier) - 0.5 * residual**2 - jnp.log(deviation) - 0.5 * jnp.log(2 * jnp.pi),
+        jnp.log(likelihood.outlier) + log_uniform,
+    )
+    valid = observation.range_valid[:n_colour]
+    log_hit = jax.nn.logsumexp(log_w + jnp.where(valid[:, None], log_depth, 0.0), axis=-1) + jnp.log1p(-eps)
+    log_not = log_miss[:n_colour] + jnp.log(eps) + jnp.where(valid, log_uniform, 0.0)
+    as_object = jnp.logaddexp(log_hit, log_not)
+
+    # colour given a hit: N(c; sum w_i c_i / O, s^2)
+    directions = jnp.broadcast_to(observation.rays.direction[:n_colour, None, :], points[:n_colour].shape)
+    if pose is not None:
+        directions = pose.to_object_direction(directions)
+    colour = field.colour(weights, points[:n_colour], directions, sigma[:n_colour])
+    w = jnp.exp(log_w)
+    opacity = jnp.sum(w, axis=-1, keepdims=True)
+    mean = (jnp.einsum("nm,nmc->nc", w, colour) + 0.5e-3) / (opacity + 1e-3)  # grey where nothing is hit
+    s = likelihood.colour_sigma
+    colour_term = jnp.sum(
+        -0.5 * ((observation.rgb[:n_colour] - mean) / s) ** 2 - jnp.log(s) - 0.5 * jnp.log(2 * jnp.pi), axis=-1
+    )
+    as_object = as_object + jnp.where(observation.rgb_valid[:n_colour], colour_term, 0.0)
+
+    # FREE and UNKNOWN: the object is not in front of the measured end (transmittance up to `limit`)
+    before = t <= observation.limit[:, None]
+    tau = -jnp.diff(faces.log_transmittance, axis=-1, prepend=0.0)
+    log_clear = -jnp.sum(jnp.where(before, tau, 0.0), axis=-1)
+    says = observation.limit > 0.0
+    as_empty = jnp.where(says, jnp.logaddexp(jnp.log(eps), jnp.log1p(-2 * eps) + log_clear), 0.0)
+
+    status = observation.status
+    is_object = jnp.zeros_like(status, dtype=bool).at[:n_colour].set(status[:n_colour] == OBJECT)
+    as_object = jnp.zeros_like(as_empty).at[:n_colour].set(as_object)
+    return jnp.where(is_object, as_object, jnp.where((status == FREE) | says, as_empty, 0.0))
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def map_with_gradient(function: Callable, batch_size: int | None, shared: Any, each: Any, x: Array) -> Float[Array, "p"]:
+    """[function(shared, each_p, x_p) for p], differentiable in `x` alone.
+
+    Value and gradient of an element are computed together, `batch_size` elements at a time (None: one by one), so that
+    memory does not grow with the batch and a CPU's caches hold one element's rays.
+    """
+    return jax.lax.map(lambda item: function(shared, *item), (each, x), batch_size=batch_size)
+
+
+def _map_forward(function, batch_size, shared, each, x):
+    def one(item):
+        return jax.value_and_grad(lambda v: function(shared, item[0], v))(item[1])
+
+    values, gradients = jax.lax.map(one, (each, x), batch_size=batch_size)
+    return values, gradients
+
+
+def _map_backward(function, batch_size, gradients, cotangent):
+    return None, None, gradients * cotangent.reshape(-1, *([1] * (gradients.ndim - 1)))
+
+
+map_with_gradient.defvjp(_map_forward, _map_backward)
+
+
+def log_likelihood(
+    args: tuple[Model, Likelihood, Observation, Float[Array, "n m"]], positions: Float[Array, "p d"]
+) -> Float[Array, "p"]:
+    """Batched log-likelihood for the samplers; differentiable in `positions` only."""
+    return map_with_gradient(_one_particle, None, args, None, positions)
+
+
+def _one_particle(args, _, position):
+    return log_likelihood_one(*args, position)
+
+
+def empty_observation_rays(count: int) -> Rays:
+    """Padding rays: they start outside the lattice and point away from it."""
+    return Rays(origin=jnp.full((count, 3), 50.0), direction=jnp.broadcast_to(jnp.array([1.0, 0.0, 0.0]), (count, 3)))

@@ -1,0 +1,245 @@
+"""The learned prior: z~ -> (RealNVP m) -> z -> (hypernetwork h) -> field weights w; and the encoder q(z | views).
+
+Paper §2.1 to §2.3. Presets change only numbers.
+"""
+
+import math
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from probnerf.field import MLPField
+
+CAMERA_FEATURES = 13  # rotation (9), position (3), tangent of the half field of view
+IMAGE_CHANNELS = 6  # rgb, object mask, unknown mask, relative range
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Every size of a model. `paper` is the paper's; `small` is for two CPU cores."""
+
+    name: str
+    latent: int  # K
+    width: int  # hidden units of both field MLPs
+    octaves: int
+    direction_octaves: int
+    flow_hidden: int
+    hyper_hidden: int
+    lattice: int  # G
+    image_size: int  # encoder input, pixels
+    encoder_channels: tuple[int, ...]
+
+    @property
+    def field(self) -> MLPField:
+        """The field whose weights the hypernetwork makes."""
+        return MLPField(width=self.width, octaves=self.octaves, direction_octaves=self.direction_octaves)
+
+
+PRESETS = {
+    preset.name: preset
+    for preset in (
+        Preset("paper", 128, 64, 10, 10, 512, 512, 128, 128, (32, 64, 128, 128, 128)),
+        Preset("small", 48, 48, 6, 1, 128, 256, 32, 32, (16, 32, 48, 64, 64)),
+        Preset("tiny", 4, 8, 2, 1, 16, 16, 8, 16, (4, 4, 4, 4, 4)),  # for tests
+    )
+}
+
+
+class TwoLayer(eqx.Module):
+    """Linear, ReLU, linear: arrays only, so that a model is a plain pytree for `jax.jit`."""
+
+    first: eqx.nn.Linear
+    last: eqx.nn.Linear
+
+    def __init__(self, inputs: int, outputs: int, hidden: int, key: PRNGKeyArray):
+        k0, k1 = jax.random.split(key)
+        self.first, self.last = eqx.nn.Linear(inputs, hidden, key=k0), eqx.nn.Linear(hidden, outputs, key=k1)
+
+    def __call__(self, x: Float[Array, "i"]) -> Float[Array, "o"]:
+        return self.last(jax.nn.relu(self.first(x)))
+
+
+class CouplingPair(eqx.Module):
+    """Two affine couplings that update complementary halves, then a fixed permutation (paper §2.3)."""
+
+    first: TwoLayer
+    second: TwoLayer
+    permutation: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(self, dim: int, hidden: int, permutation: tuple[int, ...], key: PRNGKeyArray):
+        k0, k1 = jax.random.split(key)
+        half = dim // 2
+
+        def coupling(inputs: int, outputs: int, k: PRNGKeyArray) -> TwoLayer:
+            net = TwoLayer(inputs, 2 * outputs, hidden, k)
+            zeros = jnp.zeros_like(net.last.weight), jnp.zeros_like(net.last.bias)  # start at the identity
+            return eqx.tree_at(lambda n: (n.last.weight, n.last.bias), net, zeros)
+
+        self.first, self.second, self.permutation = coupling(half, dim - half, k0), coupling(dim - half, half, k1), permutation
+
+    def forward(self, x: Float[Array, "k"]) -> tuple[Float[Array, "k"], Float[Array, ""]]:
+        """y and log |dy/dx|."""
+        half = x.shape[0] // 2
+        a, b = x[:half], x[half:]
+        shift, scale = _shift_and_scale(self.first(a))
+        b = b * jnp.exp(scale) + shift
+        log_det = jnp.sum(scale)
+        shift, scale = _shift_and_scale(self.second(b))
+        a = a * jnp.exp(scale) + shift
+        return jnp.concatenate([a, b])[jnp.array(self.permutation)], log_det + jnp.sum(scale)
+
+    def inverse(self, y: Float[Array, "k"]) -> tuple[Float[Array, "k"], Float[Array, ""]]:
+        """x and log |dx/dy|."""
+        y = y[jnp.array(np.argsort(self.permutation))]
+        half = y.shape[0] // 2
+        a, b = y[:half], y[half:]
+        shift, scale = _shift_and_scale(self.second(b))
+        a = (a - shift) * jnp.exp(-scale)
+        log_det = -jnp.sum(scale)
+        shift, scale = _shift_and_scale(self.first(a))
+        b = (b - shift) * jnp.exp(-scale)
+        return jnp.concatenate([a, b]), log_det - jnp.sum(scale)
+
+
+def _shift_and_scale(output: Float[Array, "two_k"]) -> tuple[Array, Array]:
+    shift, scale = jnp.split(output, 2)
+    return shift, 2.0 * jnp.tanh(0.5 * scale)  # bounded log-scale: a coupling can never overflow
+
+
+class RealNVP(eqx.Module):
+    """z = m(z~; zeta): two pairs of couplings."""
+
+    pairs: tuple[CouplingPair, ...]
+
+    def __init__(self, dim: int, hidden: int, key: PRNGKeyArray, pairs: int = 2):
+        permutations = np.random.default_rng(0)  # a constant of the architecture, not of the seed
+        self.pairs = tuple(
+            CouplingPair(dim, hidden, tuple(int(i) for i in permutations.permutation(dim)), k)
+            for k in jax.random.split(key, pairs)
+        )
+
+    def forward(self, z_tilde: Float[Array, "k"]) -> tuple[Float[Array, "k"], Float[Array, ""]]:
+        """z and log |dz/dz~|."""
+        z, log_det = z_tilde, jnp.zeros(())
+        for pair in self.pairs:
+            z, part = pair.forward(z)
+            log_det += part
+        return z, log_det
+
+    def inverse(self, z: Float[Array, "k"]) -> tuple[Float[Array, "k"], Float[Array, ""]]:
+        """z~ and log |dz~/dz|."""
+        log_det = jnp.zeros(())
+        for pair in reversed(self.pairs):
+            z, part = pair.inverse(z)
+            log_det += part
+        return z, log_det
+
+
+class HyperNetwork(eqx.Module):
+    """w = h(z; theta): two hidden layers, then a linear map to every field weight."""
+
+    hidden0: eqx.nn.Linear
+    hidden1: eqx.nn.Linear
+    weight: Float[Array, "d h"]
+    bias: Float[Array, "d"]
+    scale: Float[Array, "d"]  # each weight's size at initialisation (1 / sqrt(fan in)): outputs start as a fresh MLP's
+
+    def __init__(self, latent: int, hidden: int, field: MLPField, key: PRNGKeyArray):
+        k0, k1, k2, k3 = jax.random.split(key, 4)
+        self.hidden0 = eqx.nn.Linear(latent, hidden, key=k0)
+        self.hidden1 = eqx.nn.Linear(hidden, hidden, key=k1)
+        scale, start, fan_in = [], [], 1
+        for shape, k in zip(field.shapes, jax.random.split(k3, len(field.shapes)), strict=True):
+            kernel = len(shape) == 2
+            fan_in = shape[0] if kernel else fan_in
+            scale.append(jnp.full((math.prod(shape),), math.sqrt(2.0 / fan_in)))
+            start.append(scale[-1] * jax.random.normal(k, scale[-1].shape) * (1.0 if kernel else 0.0))
+        self.scale = jnp.concatenate(scale)
+        self.bias = jnp.concatenate(start) / self.scale
+        self.weight = 0.5 * jax.random.normal(k2, (field.size, hidden)) / math.sqrt(hidden)
+
+    def __call__(self, z: Float[Array, "k"]) -> Float[Array, "d"]:
+        h = jax.nn.relu(self.hidden0(z))
+        h = jax.nn.relu(self.hidden1(h))
+        return jax.lax.stop_gradient(self.scale) * (self.weight @ h + self.bias)
+
+
+class Encoder(eqx.Module):
+    """Gaussian potentials (mu_j, tau_j) of each view, combined with a learned prior potential (paper §2.2)."""
+
+    convolutions: tuple[eqx.nn.Conv2d, ...]
+    camera: TwoLayer
+    hidden: eqx.nn.Linear
+    output: eqx.nn.Linear
+    prior_mean: Float[Array, "k"]
+    prior_log_precision: Float[Array, "k"]
+
+    def __init__(self, preset: Preset, key: PRNGKeyArray):
+        keys = jax.random.split(key, len(preset.encoder_channels) + 3)
+        channels = (IMAGE_CHANNELS, *preset.encoder_channels)
+        self.convolutions = tuple(
+            eqx.nn.Conv2d(a, b, 3, stride=2, padding=1, key=k)
+            for a, b, k in zip(channels[:-1], channels[1:], keys, strict=False)
+        )
+        side = preset.image_size
+        for _ in preset.encoder_channels:
+            side = (side + 1) // 2
+        width = 4 * preset.encoder_channels[-1]
+        self.camera = TwoLayer(CAMERA_FEATURES, width // 2, width // 2, keys[-3])
+        self.hidden = eqx.nn.Linear(side * side * channels[-1] + width // 2, width, key=keys[-2])
+        self.output = eqx.nn.Linear(width, 2 * preset.latent, key=keys[-1])
+        self.prior_mean = jnp.zeros(preset.latent)
+        self.prior_log_precision = jnp.zeros(preset.latent)
+
+    def potential(self, image: Float[Array, "c s s"], camera: Float[Array, "13"]) -> tuple[Array, Array]:
+        """(mu_j, tau_j) of one view."""
+        h = image
+        for convolution in self.convolutions:
+            h = jax.nn.relu(convolution(h))
+        h = jax.nn.relu(self.hidden(jnp.concatenate([h.reshape(-1), jax.nn.relu(self.camera(camera))])))
+        mean, log_precision = jnp.split(self.output(h), 2)
+        return mean, jnp.exp(6.0 * jnp.tanh(log_precision / 6.0))
+
+    def __call__(
+        self, images: Float[Array, "j c s s"], cameras: Float[Array, "j 13"], used: Float[Array, "j"]
+    ) -> tuple[Float[Array, "k"], Float[Array, "k"]]:
+        """Mean and precision of q(z | views): precisions add, means weigh by precision. `used` is 0 for a missing view."""
+        mean, precision = jax.vmap(self.potential)(images, cameras)
+        precision = precision * used[:, None]
+        prior = jnp.exp(self.prior_log_precision)
+        total = prior + jnp.sum(precision, axis=0)
+        return (prior * self.prior_mean + jnp.sum(precision * mean, axis=0)) / total, total
+
+
+class ProbNeRF(eqx.Module):
+    """The generative model with its encoder. `preset` fixes every size."""
+
+    flow: RealNVP
+    hyper: HyperNetwork
+    encoder: Encoder
+    preset: Preset = eqx.field(static=True)
+
+    def __init__(self, preset: Preset, key: PRNGKeyArray):
+        k0, k1, k2 = jax.random.split(key, 3)
+        self.preset = preset
+        self.flow = RealNVP(preset.latent, preset.flow_hidden, k0)
+        self.hyper = HyperNetwork(preset.latent, preset.hyper_hidden, preset.field, k1)
+        self.encoder = Encoder(preset, k2)
+
+    @property
+    def field(self) -> MLPField:
+        """The field that `decode`'s weights drive."""
+        return self.preset.field
+
+    @property
+    def latent(self) -> int:
+        """K, the length of z~."""
+        return self.preset.latent
+
+    def decode(self, z_tilde: Float[Array, "k"]) -> Float[Array, "d"]:
+        """w = h(m(z~)) (paper eq. 1)."""
+        return self.hyper(self.flow.forward(z_tilde)[0])

@@ -1,0 +1,388 @@
+"""ELBO training of a prior (paper §2.2): views and solid samples of procedural objects in, ProbNeRF weights out.
+
+An object's data are (a) pixels of its views, through the same joint pixel likelihood that inference uses, on a lattice
+that is turned, shifted and scaled at random (SCIENCE §3), and (b) solid samples: is a lattice face at this point opaque?
+Solid samples cost a tenth of a ray, so the first steps use them alone. Both are observations, the objective is an ELBO
+throughout: N_rays E[log p] + N_points E[log p] - weight KL. Pixels are drawn by strata (object, near it, elsewhere) and
+weighted by each stratum's size, so that the pixel term is an unbiased estimate of its mean over all pixels.
+"""
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+from scipy import ndimage
+
+from probnerf import foam
+from probnerf.families.tabletop import TabletopObject, sample_objects, signed_distance
+from probnerf.model import Likelihood, map_with_gradient, pixel_terms
+from probnerf.prior import ProbNeRF
+from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
+from probnerf.views import ViewSet, camera_features, encoder_image
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """The recipe. Steps count optimiser updates; every number travels with the weights."""
+
+    steps: int = 30_000
+    solid_steps: int = 15_000  # of these, the first so many use solid samples alone
+    batch: int = 16  # objects per step in the solid phase
+    ray_batch: int = 8  # objects per step afterwards
+    views: int = 4  # encoder views per object; a random number of them is used
+    object_rays: int = 96
+    near_rays: int = 48  # free pixels within 2 pixels of the object
+    far_rays: int = 16
+    points: int = 768  # solid samples per object, near visible surfaces and uniform
+    effective_rays: float = 1500.0  # N_rays: independent residuals per object
+    effective_points: float = 3000.0  # N_points
+    learning_rate: float = 1.5e-3
+    final_learning_rate: float = 2e-5
+    warmup: int = 500
+    kl_warmup: int = 8_000
+    average: float = 0.999  # decay of the averaged weights, which are what is shipped
+    seed: int = 0
+    checkpoint_every: int = 500
+    log_every: int = 50
+    map_batch: int | None = None  # objects per vectorised chunk of the field (None: one by one, best on a CPU)
+
+
+class Batch(eqx.Module):
+    """One step's data, all arrays with a leading object axis."""
+
+    objects: TabletopObject
+    rgb: Array  # u8 [b, j, s, s, 3]
+    distance: Array  # f32 [b, j, s, s]
+    unknown: Array  # bool [b, j, s, s]
+    used: Array  # f32 [b, j]
+    T_object_camera: Array  # f32 [b, j, 4, 4]
+    tan_half_fov: Array  # f32 [b, j]
+    origin: Array  # f32 [b, n, 3]
+    direction: Array  # f32 [b, n, 3]
+    ray_rgb: Array  # f32 [b, n, 3]
+    ray_range: Array  # f32 [b, n], 0 on a miss
+    ray_weight: Array  # f32 [b, n], sums to about 1: the unbiased mean over all pixels of all views
+    turn: Array  # f32 [b, 4] yaw, x, y, log-scale of the object over the standing lattice
+
+
+class Strata(eqx.Module):
+    """Per object: pixel indices (into views x pixels) sorted by stratum, and where each stratum ends."""
+
+    order: np.ndarray  # i32 [N, V S S]
+    object_end: np.ndarray  # i32 [N]
+    near_end: np.ndarray  # i32 [N]
+
+
+def strata_of(views: ViewSet) -> Strata:
+    """Sort every object's pixels into object, near and far."""
+    n = len(views.seeds)
+    mask = views.range > 0
+    near = ndimage.binary_dilation(mask, np.ones((1, 1, 5, 5), bool))
+    stratum = np.where(mask, 0, np.where(near, 1, 2)).astype(np.uint8).reshape(n, -1)
+    order = np.argsort(stratum, axis=1, kind="stable").astype(np.int32)
+    return Strata(order, (stratum == 0).sum(1).astype(np.int32), (stratum <= 1).sum(1).astype(np.int32))
+
+
+def draw_batch(
+    views: ViewSet, objects: TabletopObject, strata: Strata, config: TrainConfig, step: int, size: int
+) -> Batch:
+    """The batch of one step: a function of (seed, step) alone, so that a resumed run repeats the lost one."""
+    rng = np.random.default_rng([config.seed, step, 3])
+    chosen = rng.choice(len(views.seeds), size, replace=False)
+    j, s = config.views, views.size
+    view = np.stack([rng.permutation(views.rgb.shape[1])[:j] for _ in chosen])
+    rows = chosen[:, None]
+    unknown = _half_planes(rng, size, j, s)
+    counts = rng.integers(1, j + 1, size)
+    used = (np.arange(j)[None] < counts[:, None]).astype(np.float32)
+
+    pixels = s * s * views.rgb.shape[1]
+    picks, weights = [], []
+    zero = np.zeros(size, np.int64)
+    full = np.full(size, pixels)
+    object_end, near_end = strata.object_end[chosen], strata.near_end[chosen]
+    for low, high, count in (
+        (zero, object_end, config.object_rays),
+        (object_end, near_end, config.near_rays),
+        (near_end, full, config.far_rays),
+    ):
+        width = np.maximum(high - low, 1)[:, None]
+        at = np.minimum(low[:, None] + (rng.random((size, count)) * width).astype(np.int64), pixels - 1)
+        picks.append(strata.order[rows, at])
+        weights.append(np.broadcast_to((high - low)[:, None] / (pixels * count), at.shape))
+    pick = np.concatenate(picks, axis=1)
+    v, pixel = pick // (s * s), pick % (s * s)
+    T, tangent = views.T_object_camera[rows, v], views.tan_half_fov[rows, v]
+    half = 0.5 * s
+    x = ((pixel % s) + 0.5 - half) / half * tangent
+    y = ((pixel // s) + 0.5 - half) / half * tangent
+    d = np.stack([x, y, np.ones_like(x)], -1)
+    d /= np.linalg.norm(d, axis=-1, keepdims=True)
+    turn = np.stack(
+        [
+            rng.uniform(-np.pi, np.pi, size),
+            rng.uniform(-0.05, 0.05, size),
+            rng.uniform(-0.05, 0.05, size),
+            rng.uniform(np.log(0.75), np.log(1.1), size),
+        ],
+        axis=-1,
+    )
+    return Batch(
+        objects=jax.tree.map(lambda a: a[chosen], objects),
+        rgb=views.rgb[rows, view],
+        distance=views.range[rows, view],
+        unknown=unknown,
+        used=used,
+        T_object_camera=views.T_object_camera[rows, view],
+        tan_half_fov=views.tan_half_fov[rows, view],
+        origin=T[..., :3, 3],
+        direction=np.einsum("bnij,bnj->bni", T[..., :3, :3], d).astype(np.float32),
+        ray_rgb=(views.rgb.reshape(len(views.seeds), -1, 3)[rows, pick] / 255.0).astype(np.float32),
+        ray_range=views.range.reshape(len(views.seeds), -1)[rows, pick],
+        ray_weight=np.concatenate(weights, axis=1).astype(np.float32),
+        turn=turn.astype(np.float32),
+    )
+
+
+def _half_planes(rng: np.random.Generator, b: int, j: int, s: int) -> np.ndarray:
+    """Random occluders for the encoder: a quarter of the views lose a half plane."""
+    y, x = np.mgrid[:s, :s] / s - 0.5
+    angle = rng.uniform(0, 2 * np.pi, (b, j, 1, 1))
+    offset = rng.uniform(-0.2, 0.35, (b, j, 1, 1))
+    hidden = np.cos(angle) * x + np.sin(angle) * y > offset
+    return hidden & (rng.random((b, j, 1, 1)) < 0.25)
+
+
+def encode(model: ProbNeRF, batch: Batch) -> tuple[Float[Array, "b k"], Float[Array, "b k"]]:
+    """Mean and precision of q(z | views) per object."""
+
+    def one(rgb, distance, unknown, used, T, tangent):
+        images = jax.vmap(encoder_image)(
+            rgb / 255.0, distance, unknown.astype(jnp.float32), jnp.linalg.norm(T[:, :3, 3], axis=-1)
+        )
+        return model.encoder(images, jax.vmap(camera_features)(T, tangent), used)
+
+    return jax.vmap(one)(
+        batch.rgb, batch.distance, batch.unknown, batch.used, batch.T_object_camera, batch.tan_half_fov
+    )
+
+
+def kl_estimate(model: ProbNeRF, z: Array, mean: Array, precision: Array) -> Float[Array, ""]:
+    """log q(z | views) - log N(m^-1(z); 0, I) |dm^-1/dz| at one draw z (paper, eq. of the ELBO)."""
+    z_tilde, log_det = model.flow.inverse(z)
+    log_q = 0.5 * jnp.sum(jnp.log(precision) - precision * (z - mean) ** 2)
+    return log_q - (log_det - 0.5 * jnp.sum(z_tilde**2))
+
+
+def solid_points(batch: Batch, key: Array, count: int) -> Float[Array, "b p 3"]:
+    """Where solid samples are taken: two thirds within 0.05 of visible surfaces, the rest uniform around the object."""
+    near = 2 * count // 3
+    k0, k1, k2 = jax.random.split(key, 3)
+    b, n = batch.ray_range.shape
+    surface = batch.origin + batch.ray_range[..., None] * batch.direction
+    index = jax.random.randint(k0, (b, near), 0, n)
+    hit = jnp.take_along_axis(batch.ray_range, index, axis=1) > 0
+    chosen = jnp.take_along_axis(surface, index[..., None], axis=1)
+    u = jax.random.uniform(k2, (b, count, 3), minval=-1.0, maxval=1.0)
+    near_points = chosen + 0.05 * jax.random.normal(k1, (b, near, 3))
+    return jnp.concatenate([jnp.where(hit[..., None], near_points, u[:, :near]), u[:, near:]], axis=1)
+
+
+class _PerObject(eqx.Module):
+    """What the field terms of one object need."""
+
+    points: Array
+    solid: Array
+    origin: Array
+    direction: Array
+    ray_rgb: Array
+    ray_range: Array
+    ray_weight: Array
+    turn: Array
+
+
+def _solid_terms(shared: tuple, item: _PerObject, weights: Array) -> Float[Array, ""]:
+    """Mean log-likelihood of solid samples and of surface colours (first phase)."""
+    model_field, likelihood, config, colour_weight = shared
+    tau = model_field.density(weights, item.points) / likelihood.lattice.cubes
+    opaque = -jnp.expm1(-tau)
+    eps = likelihood.mask_error
+    probability = jnp.where(item.solid, opaque, 1.0 - opaque)
+    solid = jnp.mean(jnp.log(eps + (1.0 - 2.0 * eps) * probability))
+    if not colour_weight:
+        return config.effective_points * solid
+    n = config.object_rays
+    surface = item.origin[:n] + (item.ray_range[:n, None] + 0.01) * item.direction[:n]
+    sigma = jax.lax.stop_gradient(model_field.density(weights, surface))
+    rgb = model_field.colour(weights, surface, item.direction[:n], sigma)
+    colour = -0.5 * jnp.mean(jnp.sum((rgb - item.ray_rgb[:n]) ** 2, -1)) / likelihood.colour_sigma**2
+    return config.effective_points * solid + config.effective_rays * colour_weight * colour
+
+
+def _ray_terms(shared: tuple, item: _PerObject, weights: Array) -> Float[Array, ""]:
+    """Weighted mean of the joint pixel log-likelihood over a lattice that is turned, shifted and scaled."""
+    model_field, likelihood, config, _ = shared
+    pose = Pose(yaw=item.turn[0], x=item.turn[1], y=item.turn[2], log_scale=item.turn[3])
+    scale = jnp.exp(pose.log_scale)
+    rays = Rays(origin=_to_view(pose, item.origin), direction=_turn(pose, item.direction))
+    n = config.object_rays
+    count = item.ray_range.shape[0]
+    observation = Observation(
+        rays=rays,
+        status=jnp.where(jnp.arange(count) < n, OBJECT, FREE),
+        rgb=item.ray_rgb,
+        rgb_valid=jnp.ones(count, bool),
+        range=item.ray_range * scale,
+        range_sigma=jnp.full((count,), 0.01),
+        range_valid=item.ray_range > 0,
+        limit=jnp.full((count,), 0.5 * foam.FAR),
+        pose_sigma=jnp.zeros(3),
+        colour_count=n,
+    )
+    t = foam.crossings(rays, likelihood.lattice)
+    terms = pixel_terms(model_field, weights, pose, likelihood, observation, t)
+    return config.effective_rays * jnp.sum(item.ray_weight * terms) + _solid_terms(
+        (model_field, likelihood, config, 0.0), item, weights
+    )
+
+
+def _turn(pose: Pose, d: Array) -> Array:
+    c, s = jnp.cos(pose.yaw), jnp.sin(pose.yaw)
+    return jnp.stack([c * d[:, 0] - s * d[:, 1], s * d[:, 0] + c * d[:, 1], d[:, 2]], axis=-1)
+
+
+def _to_view(pose: Pose, p: Array) -> Array:
+    """Canonical points in the view frame: the inverse of Pose.to_object."""
+    base = jnp.array([0.0, 0.0, foam.BASE_Z])
+    return jnp.exp(pose.log_scale) * _turn(pose, p - base) + base + jnp.stack([pose.x, pose.y, jnp.zeros(())])
+
+
+def loss(
+    model: ProbNeRF, batch: Batch, key: Array, kl_weight: Array, likelihood: Likelihood, config: TrainConfig, rays: bool
+) -> tuple[Array, dict[str, Array]]:
+    """Negative ELBO per object and its parts."""
+    k0, k1 = jax.random.split(key)
+    mean, precision = encode(model, batch)
+    z = mean + jax.random.normal(k0, mean.shape) / jnp.sqrt(precision)
+    kl = jnp.mean(jax.vmap(kl_estimate, in_axes=(None, 0, 0, 0))(model, z, mean, precision))
+    weights = jax.vmap(model.hyper)(z)
+    points = solid_points(batch, k1, config.points)
+    solid = jax.vmap(signed_distance)(batch.objects, points) <= 0.0
+    each = _PerObject(
+        points, solid, batch.origin, batch.direction, batch.ray_rgb, batch.ray_range, batch.ray_weight, batch.turn
+    )
+    terms = _ray_terms if rays else _solid_terms
+    fit = jnp.mean(
+        map_with_gradient(_Bound(terms, (model.field, likelihood, config, 0.3)), config.map_batch, None, each, weights)
+    )
+    return kl_weight * kl - fit, {"fit": fit, "kl": kl}
+
+
+@dataclass(frozen=True)
+class _Bound:
+    """A function with its constants: hashable, as a static argument must be."""
+
+    terms: Callable
+    constants: tuple
+
+    def __call__(self, _: Any, item: _PerObject, weights: Array) -> Array:
+        return self.terms(self.constants, item, weights)
+
+
+class TrainState(eqx.Module):
+    """Everything that a resumed run needs; batches and keys are functions of the step."""
+
+    model: ProbNeRF
+    average: ProbNeRF
+    optimiser: optax.OptState
+    step: Array
+
+
+def optimiser_of(config: TrainConfig) -> optax.GradientTransformation:
+    """Adam (paper §2.2) with warm-up, cosine decay and clipping against the rare bad batch."""
+    schedule = optax.warmup_cosine_decay_schedule(
+        0.0, config.learning_rate, min(config.warmup, config.steps // 4), config.steps, config.final_learning_rate
+    )
+    return optax.chain(optax.clip_by_global_norm(200.0), optax.adam(schedule))
+
+
+def initial_state(model: ProbNeRF, config: TrainConfig) -> TrainState:
+    """A fresh run."""
+    average = jax.tree.map(jnp.copy, model)  # its own buffers: a step gives its inputs away
+    return TrainState(model, average, optimiser_of(config).init(model), jnp.zeros((), jnp.int32))
+
+
+@eqx.filter_jit(donate="all-except-first")
+def train_step(
+    static: tuple[Likelihood, TrainConfig, bool], state: TrainState, batch: Batch
+) -> tuple[TrainState, dict[str, Array]]:
+    """One update."""
+    likelihood, config, rays = static
+    key = jax.random.fold_in(jax.random.key(config.seed), state.step)
+    kl_weight = jnp.clip(state.step / config.kl_warmup, 0.02, 1.0)
+    (value, parts), gradient = jax.value_and_grad(loss, has_aux=True)(
+        state.model, batch, key, kl_weight, likelihood, config, rays
+    )
+    update, optimiser = optimiser_of(config).update(gradient, state.optimiser)
+    model = optax.apply_updates(state.model, update)
+    decay = jnp.minimum(config.average, (1.0 + state.step) / (10.0 + state.step))
+    average = jax.tree.map(lambda a, b: decay * a + (1.0 - decay) * b, state.average, model)
+    return TrainState(model, average, optimiser, state.step + 1), {"loss": value, **parts}
+
+
+def save_checkpoint(path: Path, state: TrainState) -> None:
+    """Atomic: a killed run leaves the old checkpoint or the new one, never half of one."""
+    temporary = path.with_suffix(".tmp")
+    with open(temporary, "wb") as file:
+        eqx.tree_serialise_leaves(file, state)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def train(
+    model: ProbNeRF, views: ViewSet, likelihood: Likelihood, config: TrainConfig, folder: Path
+) -> Iterator[tuple[TrainState, dict[str, float]]]:
+    """Run or resume in `folder`; yields (state, metrics) every `log_every` steps and appends them to history.jsonl.
+
+    Raises FloatingPointError on a non-finite loss, naming the step; the last checkpoint stays.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    checkpoint, history = folder / "checkpoint.eqx", folder / "history.jsonl"
+    state = initial_state(model, config)
+    settings = folder / "config.json"
+    described = json.dumps(asdict(config), indent=1)
+    if checkpoint.exists():
+        if settings.exists() and settings.read_text() != described:
+            raise ValueError(f"{folder} holds a run of another recipe: see {settings}, or give a fresh --out")
+        state = eqx.tree_deserialise_leaves(checkpoint, state)
+        lines = history.read_text().splitlines() if history.exists() else []
+        kept = [line for line in lines if json.loads(line)["step"] <= int(state.step)]
+        history.write_text("".join(line + "\n" for line in kept))
+    settings.write_text(described)
+    objects = sample_objects([int(s) for s in views.seeds])
+    strata = strata_of(views)
+    start = int(state.step)
+    for step in range(start, config.steps):
+        rays = step >= config.solid_steps
+        batch = draw_batch(views, objects, strata, config, step, config.ray_batch if rays else config.batch)
+        state, parts = train_step((likelihood, config, rays), state, batch)
+        done = step + 1
+        if done % config.log_every == 0 or done == config.steps:
+            metrics = {k: float(v) for k, v in parts.items()}
+            if not np.isfinite(metrics["loss"]):
+                raise FloatingPointError(f"loss is {metrics['loss']} at step {done}; {checkpoint} holds an earlier step")
+            with open(history, "a") as file:
+                file.write(json.dumps({"step": done, "rays": rays, **metrics}) + "\n")
+            if done % config.checkpoint_every == 0 or done == config.steps:
+                save_checkpoint(checkpoint, state)
+            yield state, {"step": done, **metrics}
