@@ -46,7 +46,7 @@ class Hypotheses:
     T_world_camera: Float[np.ndarray, "4 4"] | None  # p_world = T_world_camera @ p_camera, metres
     opacity: UInt8[np.ndarray, "S G G G"]  # round(255 * opacity across the voxel)
     pose: Float[np.ndarray, "S 4"]  # yaw (rad), x, y (cube units), log-scale: the canonical shape in the view frame
-    weights: Float[np.ndarray, "S"]  # sum 1
+    weights: Float[np.ndarray, "S"]  # sum 1 (to 1e-6: normalise in f64)
     population: Int[np.ndarray, "S"]  # independent population (or chain) that each hypothesis comes from
     seen: Bool[np.ndarray, "G G G"]  # some camera ray passed through the voxel before its measured end, or ended in it
     inside_view: bool  # False: the object touches the picture's border, so part of it was cut off, not occluded
@@ -66,6 +66,8 @@ class Hypotheses:
         for name, want in expected.items():
             if (have := getattr(self, name).shape) != want:
                 raise ValueError(f"{name} has shape {list(have)}; with this opacity it must be {list(want)}")
+        if self.seen.dtype != np.bool_:
+            raise ValueError(f"seen is {self.seen.dtype}; it must be bool")
         if not (np.all(self.weights >= 0) and abs(float(np.sum(self.weights)) - 1.0) < 1e-6):
             raise ValueError(f"weights must not be negative and must sum to 1, not {float(np.sum(self.weights)):.6g}")
 
@@ -98,11 +100,16 @@ class Hypotheses:
         return binary_entropy(self.p_occupied)
 
     @cached_property
-    def _twin_weight(self) -> Float[np.ndarray, "S"]:
-        """Total weight of the hypotheses identical to each: resampling copies rows, and a copy is no new evidence."""
+    def twins(self) -> Int[np.ndarray, "S"]:
+        """For each hypothesis the first one identical to it: resampling copies rows, and a copy is no new evidence."""
         digests = [hashlib.blake2b(row.tobytes()).hexdigest() for row in self.opacity]
-        _, group = np.unique(digests, return_inverse=True)
-        return np.bincount(group, weights=self.weights)[group]
+        _, first, group = np.unique(digests, return_index=True, return_inverse=True)
+        return first[group]
+
+    @property
+    def _twin_weight(self) -> Float[np.ndarray, "S"]:
+        """Total weight of the hypotheses identical to each."""
+        return np.bincount(self.twins, weights=self.weights)[self.twins]
 
     @property
     def effective_hypotheses(self) -> float:
@@ -165,13 +172,15 @@ def binary_entropy(p: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     return entr(p) + entr(1.0 - p)
 
 
-def by_weight(hypotheses: Hypotheses) -> Int[np.ndarray, "S"]:
-    """Indices of the hypotheses, heaviest first (ties in order)."""
-    return np.argsort(-hypotheses.weights, kind="stable")
+def by_weight(hypotheses: Hypotheses) -> Int[np.ndarray, "D"]:
+    """Indices of the distinct hypotheses, heaviest first, the weights of identical ones added (ties in order)."""
+    total = np.bincount(hypotheses.twins, weights=hypotheses.weights)
+    distinct = np.unique(hypotheses.twins)
+    return distinct[np.argsort(-total[distinct], kind="stable")]
 
 
 def meshes(hypotheses: Hypotheses, k: int) -> list[tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]]:
-    """Closed outer surfaces of the k heaviest hypotheses: (vertices in metres in the object frame, triangles).
+    """Closed outer surfaces of the k heaviest distinct hypotheses: (vertices in metres in the object frame, triangles).
 
     Triangles turn counter-clockwise seen from outside; an empty shape has no vertices.
     """

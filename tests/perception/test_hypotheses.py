@@ -191,6 +191,7 @@ def test_newer_and_inconsistent_files_are_refused(tmp_path, mixed):
         ({"weights": np.array([0.5, 0.5, 0.5, 0.5])}, "must sum to 1"),
         ({"weights": np.array([0.5, 0.5])}, r"weights has shape \[2\]"),
         ({"opacity": mixed.opacity.astype(np.float32)}, "opacity is float32"),
+        ({"seen": mixed.seen.astype(np.uint8)}, "seen is uint8"),
     ]
     for changes, message in cases:
         path = tmp_path / "object_3.npz"
@@ -241,6 +242,7 @@ def test_copies_of_a_hypothesis_are_no_new_evidence():
     one, other = _box(0.0, 0.5), _box(0.0, 0.3)
     h = _hypotheses(np.stack([one, one, other, other]), [0.3, 0.2, 0.25, 0.25], population=np.zeros(4, np.int32))
     assert h.effective_hypotheses == pytest.approx(2.0)
+    assert by_weight(replace(h, weights=np.array([0.4, 0.0, 0.3, 0.3]))).tolist() == [2, 0] and len(meshes(h, 4)) == 2
     mean, se = h.estimate(np.array([1.0, 1.0, 0.0, 0.0]))
     assert mean == pytest.approx(0.5) and se == pytest.approx(np.sqrt(2 * 0.5**2 * 0.5**2))
 
