@@ -15,7 +15,7 @@ TEXTURES = ("plain", "banded", "labelled", "printed")
 PLAIN, BANDED, LABELLED, PRINTED = range(4)
 
 BODY_EXTENT = 1.4  # cube units
-REACH_LIMIT = 1.08  # no part's |x| exceeds this before slack
+REACH_LIMIT = 0.95  # no part's |x| exceeds this before slack, so that the cube holds it after
 SLACK_LOG_SCALE = 0.05  # standard deviations of the placement in the cube
 SLACK_SHIFT = 0.03
 
