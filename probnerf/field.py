@@ -16,7 +16,7 @@ from probnerf.types import BASE_Z
 
 
 class Field(Protocol):
-    """What the renderer and the occupancy operator need of a field; parameters are one object's, points in its frame."""
+    """What renderer and occupancy operator need of a field; parameters are one object's, points in its frame."""
 
     def density(self, weights: Float[Array, "d"], points: Float[Array, "... 3"]) -> Float[Array, "..."]:
         """Density sigma >= 0 per point; a lattice face there has optical depth scale * sigma / G."""
@@ -40,9 +40,17 @@ def sincospi(u: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, 
     """
     h = 0.5 * (u - 2.0 * jnp.floor(0.5 * u + 0.5))  # exact in floating point; |h| <= 1/2
     y = h * h
-    s = h * (3.14159265 + y * (-5.16771278 + y * (2.55016404 + y * (-0.59926453 + y * (0.08214589 - 0.00737043 * y)))))
-    c = 1.0 + y * (-4.93480220 + y * (4.05871213 + y * (-1.33526277 + y * (0.23533063 + y * (-0.02580689 + 0.00192957 * y)))))
+    s = h * _polynomial(y, (3.14159265, -5.16771278, 2.55016404, -0.59926453, 0.08214589, -0.00737043))
+    c = _polynomial(y, (1.0, -4.93480220, 4.05871213, -1.33526277, 0.23533063, -0.02580689, 0.00192957))
     return 2.0 * s * c, (c - s) * (c + s)
+
+
+def _polynomial(y: Float[Array, "..."], coefficients: tuple[float, ...]) -> Float[Array, "..."]:
+    """Horner's rule, lowest power first."""
+    value = jnp.full_like(y, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        value = value * y + coefficient
+    return value
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(1,))
@@ -70,7 +78,8 @@ def _encode_backward(octaves, features, g):
     gradient = g[:3]
     for j in range(octaves):
         i = 3 + 6 * j
-        gradient += (2.0**j * jnp.pi) * (g[i : i + 3] * features[i + 3 : i + 6] - g[i + 3 : i + 6] * features[i : i + 3])
+        sine, cosine = features[i : i + 3], features[i + 3 : i + 6]
+        gradient += (2.0**j * jnp.pi) * (g[i : i + 3] * cosine - g[i + 3 : i + 6] * sine)
     return (gradient,)
 
 
@@ -130,7 +139,8 @@ class MLPField(eqx.Module):
         """RGB from encode(x), encode(v) and log(1 + sigma) (its logarithm: sigma spans 0 to thousands)."""
         *_, k0, b0, k1, b1, k2, b2 = self.unpack(weights)
         position, direction = _columns(points), _columns(directions)
-        inputs = [encode(position, self.octaves), encode(direction, self.direction_octaves), jnp.log1p(sigma).reshape(1, -1)]
+        seen = encode(direction, self.direction_octaves)
+        inputs = [encode(position, self.octaves), seen, jnp.log1p(sigma).reshape(1, -1)]
         output = _mlp(jnp.concatenate(inputs, axis=0), k0, b0, k1, b1, k2, b2)
         return jax.nn.sigmoid(output).T.reshape(points.shape)
 
@@ -147,7 +157,7 @@ def _mlp(x, k0, b0, k1, b1, k2, b2):
 
 
 class CylinderField(eqx.Module):
-    """The analytic field: a closed cylinder with a box-shaped handle at +x (SCIENCE §1). Parameters: (handle length, radius).
+    """The analytic field: a closed cylinder with a box-shaped handle at +x. Parameters: (handle length, radius).
 
     Its posterior over yaw, handle length and size is integrated by brute force in the tests: no training stands between
     the samplers and a right answer.

@@ -4,8 +4,8 @@ Symbols: G lattice cubes per 2 units, so faces every 2/G; t_i sorted distances o
 families of faces; sigma_i density there; s the object's scale; tau_i = s sigma_i / G the optical depth of a face;
 w_i = T_i (1 - exp(-tau_i)) compositing weights; T_i = exp(-sum_{j<i} tau_j) transmittance before face i.
 
-Crossings depend on the observation alone (the lattice stands still in the view frame; the pose moves the field), so they
-are constants of the view and everything that follows is smooth in the weights and in the pose.
+Crossings depend on the observation alone (the lattice stands still in the view frame; the pose moves the field), so
+they are constants of the view and everything that follows is smooth in the weights and in the pose.
 """
 
 import equinox as eqx
@@ -13,13 +13,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from probnerf.field import Field
 from probnerf.types import BASE_Z, Pose, Rays
 
 FAR = 1e3  # a padding crossing stands here, beyond everything
 
 
 class Lattice(eqx.Module):
-    """A lattice of faces. `extent` may exceed 1: a moved object can leave the unit cube. Turned and shifted in training."""
+    """A lattice of faces, turned and shifted in training. `extent` may exceed 1: a moved object can leave the cube."""
 
     cubes: int = eqx.field(static=True)  # G: cubes per 2 units
     extent: float = eqx.field(static=True, default=1.0)  # the lattice covers [-extent, extent]^3
@@ -43,7 +44,8 @@ def crossings(rays: Rays, lattice: Lattice, shift: Float[Array, "3"] | float = 0
     """
     offsets = (jnp.arange(lattice.planes) - (lattice.planes - 1) / 2) * (2.0 / lattice.cubes)
     faces = offsets[None, :] + jnp.broadcast_to(jnp.asarray(shift), (3,))[:, None]  # [3, planes]
-    direction = jnp.where(jnp.abs(rays.direction) < 1e-9, 1e-9, rays.direction)  # a ray along a face crosses it far away
+    # a ray along a face crosses it far away
+    direction = jnp.where(jnp.abs(rays.direction) < 1e-9, 1e-9, rays.direction)
     t = (faces[None] - rays.origin[:, :, None]) / direction[:, :, None]  # [n, 3, planes]
     points = rays.origin[:, None, None, :] + t[..., None] * direction[:, None, None, :]
     low = jnp.array([-lattice.extent, -lattice.extent, BASE_Z]) - 1e-6
@@ -68,7 +70,7 @@ def spacing(t: Float[Array, "n m"]) -> Float[Array, "n m"]:
 
 
 def window(points: Float[Array, "... 3"], margin: float = 0.1) -> Float[Array, "..."]:
-    """1 inside the canonical cube, smoothly 0 beyond `margin` outside it (encodings repeat there); 0 below the plane."""
+    """1 inside the canonical cube, smoothly 0 beyond `margin` outside (encodings repeat there); 0 below the plane."""
     beyond = jnp.max(jnp.abs(points), axis=-1) - 1.0
     below = (BASE_Z - 0.02) - points[..., 2]
     u = jnp.clip(1.0 - jnp.maximum(beyond, 5.0 * below) / margin, 0.0, 1.0)
@@ -76,7 +78,7 @@ def window(points: Float[Array, "... 3"], margin: float = 0.1) -> Float[Array, "
 
 
 class FaceWeights(eqx.Module):
-    """What compositing gives, per ray and crossing (logarithms, so that long empty or saturated rays keep gradients)."""
+    """What compositing gives per ray and crossing: logarithms, so that empty and saturated rays keep gradients."""
 
     log_weight: Float[Array, "... n m"]  # log w_i (eq. of compositing); -inf-like (-1e4) on padding
     log_transmittance: Float[Array, "... n m"]  # log T after face i
@@ -112,14 +114,15 @@ class Render(eqx.Module):
     t: Float[Array, "n m"]
 
 
-def render(field, weights, rays: Rays, lattice: Lattice, pose: Pose | None = None) -> Render:
-    """Render rays of the view frame. `field` has .density(weights, points) and .colour(weights, points, directions, sigma)."""
+def render(field: Field, weights: Float[Array, "d"], rays: Rays, lattice: Lattice, pose: Pose | None = None) -> Render:
+    """Render rays of the view frame; `weights` are the field's."""
     t = crossings(rays, lattice)
     points = points_on_rays(rays, t)
     directions = jnp.broadcast_to(rays.direction[:, None, :], points.shape)
     scale = jnp.ones(())
     if pose is not None:
-        points, directions, scale = pose.to_object(points), pose.to_object_direction(directions), jnp.exp(pose.log_scale)
+        points, directions = pose.to_object(points), pose.to_object_direction(directions)
+        scale = jnp.exp(pose.log_scale)
     sigma = field.density(weights, points) * window(points)
     colour = field.colour(weights, points, directions, sigma)
     faces = composite(sigma, t, scale / lattice.cubes)
@@ -130,7 +133,14 @@ def render(field, weights, rays: Rays, lattice: Lattice, pose: Pose | None = Non
     return Render(opacity=opacity, colour=jnp.einsum("nm,nmc->nc", w, colour), distance=distance, weights=w, t=t)
 
 
-def render_picture(field, weights, rays: Rays, lattice: Lattice, pose: Pose | None = None, chunk: int = 1024) -> Render:
+def render_picture(
+    field: Field,
+    weights: Float[Array, "d"],
+    rays: Rays,
+    lattice: Lattice,
+    pose: Pose | None = None,
+    chunk: int = 1024,
+) -> Render:
     """`render` over many rays in chunks of constant size (host-side loop is inside `lax.map`)."""
     n = rays.origin.shape[0]
     pad = -n % chunk

@@ -1,7 +1,7 @@
-"""log p(observation | position): what camera pixels say, and the position vector that samplers move (SCIENCE §1 to §3).
+"""log p(observation | position): what camera pixels say, and the position vector that samplers move.
 
-A position is a flat vector [z~ (K) | a, b, x, y, log-scale (5, if the pose is unknown) | delta (D, if open)], each entry
-a priori N(0, 1), so the log prior is the same standard normal for every model and tempering is one multiply.
+A position is a flat vector [z~ (K) | a, b, x, y, log-scale (5, if the pose is unknown) | delta (D, if open)], each
+entry a priori N(0, 1), so the log prior is the same standard normal for every model and tempering is one multiply.
 """
 
 from collections.abc import Callable
@@ -71,9 +71,8 @@ def pose_of(latent: Float[Array, "5"], pose_sigma: Float[Array, "3"]) -> Pose:
     # atan2 has no gradient at the origin, a point of measure zero that float32 could still meet
     at_origin = (a * a + b * b) < 1e-12
     yaw = jnp.arctan2(b, jnp.where(at_origin, 1.0, a))
-    return Pose(
-        yaw=yaw, x=latent[..., 2] * pose_sigma[0], y=latent[..., 3] * pose_sigma[1], log_scale=latent[..., 4] * pose_sigma[2]
-    )
+    x, y, log_scale = (latent[..., 2 + i] * pose_sigma[i] for i in range(3))
+    return Pose(yaw=yaw, x=x, y=y, log_scale=log_scale)
 
 
 def split_position(
@@ -170,7 +169,9 @@ def pixel_terms(
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def map_with_gradient(function: Callable, batch_size: int | None, shared: Any, each: Any, x: Array) -> Float[Array, "p"]:
+def map_with_gradient(
+    function: Callable, batch_size: int | None, shared: Any, each: Any, x: Array
+) -> Float[Array, "p"]:
     """[function(shared, each_p, x_p) for p], differentiable in `x` alone.
 
     Value and gradient of an element are computed together, `batch_size` elements at a time (None: one by one), so that
@@ -202,7 +203,8 @@ def log_likelihood(
 
 
 def _one_particle(args, _, position):
-    return log_likelihood_one(*args, position)
+    model, likelihood, observation, t = args
+    return log_likelihood_one(model, likelihood, observation, t, position)
 
 
 def empty_observation_rays(count: int) -> Rays:

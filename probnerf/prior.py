@@ -76,10 +76,11 @@ class CouplingPair(eqx.Module):
 
         def coupling(inputs: int, outputs: int, k: PRNGKeyArray) -> TwoLayer:
             net = TwoLayer(inputs, 2 * outputs, hidden, k)
-            zeros = jnp.zeros_like(net.last.weight), jnp.zeros_like(net.last.bias)  # start at the identity
-            return eqx.tree_at(lambda n: (n.last.weight, n.last.bias), net, zeros)
+            # start at the identity
+            return eqx.tree_at(lambda n: n.last, net, jax.tree.map(jnp.zeros_like, net.last))
 
-        self.first, self.second, self.permutation = coupling(half, dim - half, k0), coupling(dim - half, half, k1), permutation
+        self.first, self.second = coupling(half, dim - half, k0), coupling(dim - half, half, k1)
+        self.permutation = permutation
 
     def forward(self, x: Float[Array, "k"]) -> tuple[Float[Array, "k"], Float[Array, ""]]:
         """y and log |dy/dx|."""
@@ -207,7 +208,7 @@ class Encoder(eqx.Module):
     def __call__(
         self, images: Float[Array, "j c s s"], cameras: Float[Array, "j 13"], used: Float[Array, "j"]
     ) -> tuple[Float[Array, "k"], Float[Array, "k"]]:
-        """Mean and precision of q(z | views): precisions add, means weigh by precision. `used` is 0 for a missing view."""
+        """Mean and precision of q(z | views): precisions add, means weigh by them. `used` is 0 for a missing view."""
         mean, precision = jax.vmap(self.potential)(images, cameras)
         precision = precision * used[:, None]
         prior = jnp.exp(self.prior_log_precision)
