@@ -380,7 +380,9 @@ def train(
         if done % config.log_every == 0 or done == config.steps:
             metrics = {k: float(v) for k, v in parts.items()}
             if not np.isfinite(metrics["loss"]):
-                raise FloatingPointError(f"loss is {metrics['loss']} at step {done}; {checkpoint} holds an earlier step")
+                raise FloatingPointError(
+                    f"loss is {metrics['loss']} at step {done}; {checkpoint} holds an earlier step"
+                )
             with open(history, "a") as file:
                 file.write(json.dumps({"step": done, "rays": rays, **metrics}) + "\n")
             if done % config.checkpoint_every == 0 or done == config.steps:

@@ -44,7 +44,9 @@ def random_camera(rng: np.random.Generator) -> tuple[np.ndarray, float]:
     return look_at(position, target), float(tan_half)
 
 
-def draw_views(seeds: np.ndarray, views: int, size: int, slack: float = 1.0, progress=lambda done, total: None) -> ViewSet:
+def draw_views(
+    seeds: np.ndarray, views: int, size: int, slack: float = 1.0, progress=lambda done, total: None
+) -> ViewSet:
     """Render `views` random pictures of each object; the cameras are a function of the object's seed."""
     rgb = np.zeros((len(seeds), views, size, size, 3), np.uint8)
     ranges = np.zeros((len(seeds), views, size, size), np.float32)
@@ -85,7 +87,10 @@ def camera_features(T_object_camera: Float[Array, "4 4"], tan_half_fov: Float[Ar
 
 
 def encoder_image(
-    rgb: Float[Array, "s s 3"], distance: Float[Array, "s s"], unknown: Float[Array, "s s"], camera_distance: Float[Array, ""]
+    rgb: Float[Array, "s s 3"],
+    distance: Float[Array, "s s"],
+    unknown: Float[Array, "s s"],
+    camera_distance: Float[Array, ""],
 ) -> Float[Array, "6 s s"]:
     """Channels first: masked colour, object mask, unknown mask, range relative to the camera's distance from the cube."""
     mask = ((distance > 0.0) & (unknown < 0.5)).astype(jnp.float32)

@@ -1,0 +1,184 @@
+"""Observation in, Posterior out: the model, the pixel likelihood and a sampler put together (unit cube only)."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from probnerf import foam
+from probnerf.hmc import AnnealedHMCConfig, StageInfo, annealed_hmc
+from probnerf.model import Likelihood, Model, faces_of_view, log_likelihood, pose_of, split_position
+from probnerf.prior import ProbNeRF
+from probnerf.proposal import Picture, propose
+from probnerf.smc import TemperedSMCConfig, tempered_smc
+from probnerf.types import OBJECT, UNKNOWN, Observation, Pose, Posterior
+
+Method = Literal["tempered_smc", "annealed_hmc"]
+
+
+@dataclass(frozen=True)
+class InferConfig:
+    """Which sampler, how much of it, and the pixel likelihood's numbers."""
+
+    method: Method = "tempered_smc"
+    smc: TemperedSMCConfig = field(default_factory=TemperedSMCConfig)
+    hmc: AnnealedHMCConfig = field(default_factory=AnnealedHMCConfig)
+    lattice: int = 32  # G: cubes per 2 units
+    extent: float = 1.1  # the lattice covers [-extent, extent]^3: an object may be larger than its guessed cube
+    colour_sigma: float = 0.1  # s
+    wall_sigma: float = 0.02  # cube units: floor of the model's own error in a wall's place
+    encoder_starts: bool = True  # propose starts by the encoder, in a defensive mixture with the prior
+    sample_delta: bool = False  # also infer the weights' perturbation delta
+
+
+def likelihood_of(config: InferConfig, observation: Observation, sample_pose: bool = True) -> Likelihood:
+    """The likelihood's settings for one view; crossings are padded to a multiple of 16, so that few sizes compile."""
+    lattice = foam.Lattice(config.lattice, config.extent)
+    most = foam.count_crossings(observation.rays, lattice)
+    padded = min(16 * max(1, math.ceil(most / 16)), 3 * lattice.planes)
+    return Likelihood(
+        lattice=replace_crossings(lattice, padded),
+        colour_sigma=config.colour_sigma,
+        wall_sigma=config.wall_sigma,
+        sample_pose=sample_pose,
+        sample_delta=config.sample_delta,
+    )
+
+
+def replace_crossings(lattice: foam.Lattice, crossings: int) -> foam.Lattice:
+    """The same lattice, keeping the first `crossings` of each ray."""
+    return foam.Lattice(lattice.cubes, lattice.extent, crossings)
+
+
+def infer(
+    key: Array,
+    model: Model,
+    observation: Observation,
+    config: InferConfig | None = None,
+    *,
+    picture: Picture | None = None,
+    sample_pose: bool = True,
+    on_stage: Callable[[StageInfo], None] | None = None,
+    deadline: float | None = None,
+    stages: int | None = None,
+) -> tuple[Posterior, Likelihood]:
+    """Sample p(z~, pose, delta | observation).
+
+    `picture` lets the encoder propose starts (ProbNeRF models only). `deadline` is on time.monotonic()'s clock;
+    `stages` caps the sampler's stages (iterations of annealed HMC, whose schedule is shortened to fit).
+    """
+    config = config or InferConfig()
+    likelihood = likelihood_of(config, observation, sample_pose)
+    args = (model, likelihood, observation, faces_of_view(observation, likelihood.lattice))
+    dim = likelihood.dim(model)
+    if config.method == "annealed_hmc":
+        hmc = (
+            config.hmc if stages is None else replace(config.hmc, iterations=stages, keep=min(config.hmc.keep, stages))
+        )
+        return annealed_hmc(key, log_likelihood, args, dim, hmc, on_stage=on_stage, deadline=deadline), likelihood
+    initial = None
+    if picture is not None and config.encoder_starts and isinstance(model, ProbNeRF) and not config.sample_delta:
+        key, start = jax.random.split(key)
+        initial = propose(
+            start,
+            model,
+            likelihood,
+            picture,
+            observation.pose_sigma,
+            config.smc.populations,
+            config.smc.start_particles,
+        )
+    posterior = tempered_smc(
+        key, log_likelihood, args, dim, config.smc, initial=initial, on_stage=on_stage, deadline=deadline, stages=stages
+    )
+    return posterior, likelihood
+
+
+def thin(posterior: Posterior, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(indices, weights f64, population) of about `count` representative samples.
+
+    Each population keeps an equal number of them, taken systematically by weight, and its own share of the weight: a
+    planner sees every population, and their disagreement is the Monte Carlo error.
+    """
+    log_w = np.asarray(posterior.log_weights, np.float64)
+    population = np.asarray(posterior.population)
+    names = np.unique(population)
+    each = max(1, count // len(names))
+    indices, weights = [], []
+    for name in names:
+        members = np.flatnonzero(population == name)
+        w = np.exp(log_w[members] - log_w[members].max())
+        share = np.exp(log_w[members]).sum()
+        at = np.searchsorted(np.cumsum(w) / w.sum(), (np.arange(each) + 0.5) / each)
+        indices.append(members[np.minimum(at, len(members) - 1)])
+        weights.append(np.full(each, share / each))
+    w = np.concatenate(weights)
+    w = w / w.sum() if w.sum() > 0 else np.full(len(w), 1.0 / len(w))
+    return np.concatenate(indices), w, np.repeat(names, each)
+
+
+@partial(jax.jit, static_argnames=("grid",))
+def opacity_grids(
+    model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "3"], *, grid: int
+) -> UInt8[Array, "s g g g"]:
+    """round(255 x opacity across a voxel) of each position's shape on [-1, 1]^3 of the view frame."""
+    axis = -1.0 + (jnp.arange(grid) + 0.5) * 2.0 / grid
+    points = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+
+    def one(position: Float[Array, "d"]) -> UInt8[Array, "v"]:
+        weights, pose = split_position(model, likelihood, position, pose_sigma)
+        moved, scale = points, jnp.ones(())
+        if pose is not None:
+            moved, scale = pose.to_object(points), jnp.exp(pose.log_scale)
+        sigma = model.field.density(weights, moved) * foam.window(moved)
+        return jnp.round(-255.0 * jnp.expm1(-sigma * scale / grid)).astype(jnp.uint8)
+
+    return jax.lax.map(one, positions).reshape(-1, grid, grid, grid)
+
+
+def poses(model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "3"]) -> Pose:
+    """Pose of each position (identity where the pose was known)."""
+    if not likelihood.sample_pose:
+        zeros = jnp.zeros(positions.shape[0])
+        return Pose(zeros, zeros, zeros, zeros)
+    k = model.latent
+    return pose_of(positions[:, k : k + 5], pose_sigma)
+
+
+@jax.jit
+def explained(
+    model: Model, likelihood: Likelihood, observation: Observation, positions: Float[Array, "s d"]
+) -> Float[Array, "s"]:
+    """Share of telling pixels that each position explains: object pixels hit at the measured range, free ones missed.
+
+    A range is explained within 3 standard deviations (sensor, wall and face spacing) or 0.06 cube units.
+    """
+    t = faces_of_view(observation, likelihood.lattice)
+    status = observation.status
+    tells = (status != UNKNOWN) | (observation.limit > 0)
+
+    def one(position: Float[Array, "d"]) -> Float[Array, ""]:
+        weights, pose = split_position(model, likelihood, position, observation.pose_sigma)
+        points, scale = foam.points_on_rays(observation.rays, t), jnp.ones(())
+        if pose is not None:
+            points, scale = pose.to_object(points), jnp.exp(pose.log_scale)
+        sigma = model.field.density(weights, points) * foam.window(points)
+        faces = foam.composite(sigma, t, scale / likelihood.lattice.cubes)
+        w = jnp.exp(faces.log_weight)
+        hit = -jnp.expm1(faces.log_transmittance[:, -1])
+        tolerance = jnp.maximum(3.0 * jnp.sqrt(observation.range_sigma**2 + likelihood.wall_sigma**2), 0.06)
+        close = jnp.abs(t - observation.range[:, None]) <= tolerance[:, None]
+        at_range = jnp.sum(jnp.where(close, w, 0.0), axis=-1)
+        before = jnp.sum(jnp.where(t <= observation.limit[:, None], w, 0.0), axis=-1)
+        good = jnp.where(
+            status == OBJECT, jnp.where(observation.range_valid, at_range, hit), 1.0 - jnp.where(tells, before, 0.0)
+        )
+        return jnp.sum(jnp.where(tells, good > 0.5, False)) / jnp.maximum(jnp.sum(tells), 1)
+
+    return jax.lax.map(one, positions)
