@@ -16,7 +16,7 @@ from probnerf.views import camera_features, encoder_image
 
 
 class Picture(eqx.Module):
-    """What the encoder sees: a square view of the cube, by a camera that looks at its centre (view frame, cube units)."""
+    """What the encoder sees: a square view of the cube by a camera that looks at its centre (view frame)."""
 
     rgb: Float[Array, "s s 3"]  # in [0, 1]
     distance: Float[Array, "s s"]  # along the ray; 0 where the pixel is not the object
@@ -26,7 +26,7 @@ class Picture(eqx.Module):
 
 
 def potential_at(model: ProbNeRF, picture: Picture, pose: Pose, flatten: float) -> tuple[Array, Array]:
-    """Mean and precision of q(z | picture) if the object stood at `pose`; `flatten` < 1 widens the encoder's Gaussian."""
+    """Mean and precision of q(z | picture) if the object stood at `pose`; `flatten` < 1 widens the Gaussian."""
     T = picture.T_view_camera
     position = pose.to_object(T[:3, 3])
     rotation = pose.to_object_direction(T[:3, :3].T).T

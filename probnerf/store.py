@@ -53,7 +53,7 @@ def load_prior(path: Path | None = None, preset: str | None = None) -> Prior:
     try:
         with safe_open(path, framework="np") as file:
             story = json.loads((file.metadata() or {}).get("farside", "{}"))
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+            arrays = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, json.JSONDecodeError, OSError) as error:
         raise ValueError(f"{path} is not a readable prior ({error}); train one with `farside train`") from None
     if story.get("format") != FORMAT or story.get("preset") not in PRESETS:

@@ -1,8 +1,8 @@
 """ELBO training of a prior (paper §2.2): views and solid samples of procedural objects in, ProbNeRF weights out.
 
 An object's data are (a) pixels of its views, through the same joint pixel likelihood that inference uses, on a lattice
-that is turned, shifted and scaled at random (SCIENCE §3), and (b) solid samples: is a lattice face at this point opaque?
-Solid samples cost a tenth of a ray, so the first steps use them alone. Both are observations, the objective is an ELBO
+that is turned, shifted and scaled at random (SCIENCE §3), and (b) solid samples: is a face at this point opaque? They
+cost a tenth of a ray, so the first steps use them alone. Both are observations, the objective is an ELBO
 throughout: N_rays E[log p] + N_points E[log p] - weight KL. Pixels are drawn by strata (object, near it, elsewhere) and
 weighted by each stratum's size, so that the pixel term is an unbiased estimate of its mean over all pixels.
 """
@@ -20,10 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float
-from scipy import ndimage
 
 from probnerf import foam
-from probnerf.families.tabletop import TabletopObject, sample_objects, signed_distance
+from probnerf.batches import Batch, draw_batch, solid_points, strata_of
+from probnerf.families.tabletop import sample_objects, signed_distance
 from probnerf.model import Likelihood, map_with_gradient, pixel_terms
 from probnerf.prior import ProbNeRF
 from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
@@ -56,112 +56,6 @@ class TrainConfig:
     map_batch: int | None = None  # objects per vectorised chunk of the field (None: one by one, best on a CPU)
 
 
-class Batch(eqx.Module):
-    """One step's data, all arrays with a leading object axis."""
-
-    objects: TabletopObject
-    rgb: Array  # u8 [b, j, s, s, 3]
-    distance: Array  # f32 [b, j, s, s]
-    unknown: Array  # bool [b, j, s, s]
-    used: Array  # f32 [b, j]
-    T_object_camera: Array  # f32 [b, j, 4, 4]
-    tan_half_fov: Array  # f32 [b, j]
-    origin: Array  # f32 [b, n, 3]
-    direction: Array  # f32 [b, n, 3]
-    ray_rgb: Array  # f32 [b, n, 3]
-    ray_range: Array  # f32 [b, n], 0 on a miss
-    ray_weight: Array  # f32 [b, n], sums to about 1: the unbiased mean over all pixels of all views
-    turn: Array  # f32 [b, 4] yaw, x, y, log-scale of the object over the standing lattice
-
-
-class Strata(eqx.Module):
-    """Per object: pixel indices (into views x pixels) sorted by stratum, and where each stratum ends."""
-
-    order: np.ndarray  # i32 [N, V S S]
-    object_end: np.ndarray  # i32 [N]
-    near_end: np.ndarray  # i32 [N]
-
-
-def strata_of(views: ViewSet) -> Strata:
-    """Sort every object's pixels into object, near and far."""
-    n = len(views.seeds)
-    mask = views.range > 0
-    near = ndimage.binary_dilation(mask, np.ones((1, 1, 5, 5), bool))
-    stratum = np.where(mask, 0, np.where(near, 1, 2)).astype(np.uint8).reshape(n, -1)
-    order = np.argsort(stratum, axis=1, kind="stable").astype(np.int32)
-    return Strata(order, (stratum == 0).sum(1).astype(np.int32), (stratum <= 1).sum(1).astype(np.int32))
-
-
-def draw_batch(
-    views: ViewSet, objects: TabletopObject, strata: Strata, config: TrainConfig, step: int, size: int
-) -> Batch:
-    """The batch of one step: a function of (seed, step) alone, so that a resumed run repeats the lost one."""
-    rng = np.random.default_rng([config.seed, step, 3])
-    chosen = rng.choice(len(views.seeds), size, replace=False)
-    j, s = config.views, views.size
-    view = np.stack([rng.permutation(views.rgb.shape[1])[:j] for _ in chosen])
-    rows = chosen[:, None]
-    unknown = _half_planes(rng, size, j, s)
-    counts = rng.integers(1, j + 1, size)
-    used = (np.arange(j)[None] < counts[:, None]).astype(np.float32)
-
-    pixels = s * s * views.rgb.shape[1]
-    picks, weights = [], []
-    zero = np.zeros(size, np.int64)
-    full = np.full(size, pixels)
-    object_end, near_end = strata.object_end[chosen], strata.near_end[chosen]
-    for low, high, count in (
-        (zero, object_end, config.object_rays),
-        (object_end, near_end, config.near_rays),
-        (near_end, full, config.far_rays),
-    ):
-        width = np.maximum(high - low, 1)[:, None]
-        at = np.minimum(low[:, None] + (rng.random((size, count)) * width).astype(np.int64), pixels - 1)
-        picks.append(strata.order[rows, at])
-        weights.append(np.broadcast_to((high - low)[:, None] / (pixels * count), at.shape))
-    pick = np.concatenate(picks, axis=1)
-    v, pixel = pick // (s * s), pick % (s * s)
-    T, tangent = views.T_object_camera[rows, v], views.tan_half_fov[rows, v]
-    half = 0.5 * s
-    x = ((pixel % s) + 0.5 - half) / half * tangent
-    y = ((pixel // s) + 0.5 - half) / half * tangent
-    d = np.stack([x, y, np.ones_like(x)], -1)
-    d /= np.linalg.norm(d, axis=-1, keepdims=True)
-    turn = np.stack(
-        [
-            rng.uniform(-np.pi, np.pi, size),
-            rng.uniform(-0.05, 0.05, size),
-            rng.uniform(-0.05, 0.05, size),
-            rng.uniform(np.log(0.75), np.log(1.1), size),
-        ],
-        axis=-1,
-    )
-    return Batch(
-        objects=jax.tree.map(lambda a: a[chosen], objects),
-        rgb=views.rgb[rows, view],
-        distance=views.range[rows, view],
-        unknown=unknown,
-        used=used,
-        T_object_camera=views.T_object_camera[rows, view],
-        tan_half_fov=views.tan_half_fov[rows, view],
-        origin=T[..., :3, 3],
-        direction=np.einsum("bnij,bnj->bni", T[..., :3, :3], d).astype(np.float32),
-        ray_rgb=(views.rgb.reshape(len(views.seeds), -1, 3)[rows, pick] / 255.0).astype(np.float32),
-        ray_range=views.range.reshape(len(views.seeds), -1)[rows, pick],
-        ray_weight=np.concatenate(weights, axis=1).astype(np.float32),
-        turn=turn.astype(np.float32),
-    )
-
-
-def _half_planes(rng: np.random.Generator, b: int, j: int, s: int) -> np.ndarray:
-    """Random occluders for the encoder: a quarter of the views lose a half plane."""
-    y, x = np.mgrid[:s, :s] / s - 0.5
-    angle = rng.uniform(0, 2 * np.pi, (b, j, 1, 1))
-    offset = rng.uniform(-0.2, 0.35, (b, j, 1, 1))
-    hidden = np.cos(angle) * x + np.sin(angle) * y > offset
-    return hidden & (rng.random((b, j, 1, 1)) < 0.25)
-
-
 def encode(model: ProbNeRF, batch: Batch) -> tuple[Float[Array, "b k"], Float[Array, "b k"]]:
     """Mean and precision of q(z | views) per object."""
 
@@ -181,20 +75,6 @@ def kl_estimate(model: ProbNeRF, z: Array, mean: Array, precision: Array) -> Flo
     z_tilde, log_det = model.flow.inverse(z)
     log_q = 0.5 * jnp.sum(jnp.log(precision) - precision * (z - mean) ** 2)
     return log_q - (log_det - 0.5 * jnp.sum(z_tilde**2))
-
-
-def solid_points(batch: Batch, key: Array, count: int) -> Float[Array, "b p 3"]:
-    """Where solid samples are taken: two thirds within 0.05 of visible surfaces, the rest uniform around the object."""
-    near = 2 * count // 3
-    k0, k1, k2 = jax.random.split(key, 3)
-    b, n = batch.ray_range.shape
-    surface = batch.origin + batch.ray_range[..., None] * batch.direction
-    index = jax.random.randint(k0, (b, near), 0, n)
-    hit = jnp.take_along_axis(batch.ray_range, index, axis=1) > 0
-    chosen = jnp.take_along_axis(surface, index[..., None], axis=1)
-    u = jax.random.uniform(k2, (b, count, 3), minval=-1.0, maxval=1.0)
-    near_points = chosen + 0.05 * jax.random.normal(k1, (b, near, 3))
-    return jnp.concatenate([jnp.where(hit[..., None], near_points, u[:, :near]), u[:, near:]], axis=1)
 
 
 class _PerObject(eqx.Module):

@@ -1,7 +1,7 @@
 """The arrays that flow through `probnerf`. Everything here lives in the unit cube of the *view frame*.
 
 View frame: gravity-aligned (z up), origin at the cube's centre, +x pointing horizontally from the object to the camera,
-one unit = `half_extent` metres of the ObjectFrame. The support plane is z = BASE_Z. Metres and pixels stop at `perception`.
+one unit = `half_extent` metres of the ObjectFrame. The support plane is z = BASE_Z. Metres stop at `perception`.
 """
 
 import equinox as eqx
@@ -25,7 +25,7 @@ class Rays(eqx.Module):
 class Observation(eqx.Module):
     """What N pixels of one view say about one object (view frame, cube units).
 
-    Rays `[0, colour_count)` may be OBJECT pixels and carry colour; later ones never do, so the colour network skips them.
+    Rays `[0, colour_count)` may be OBJECT pixels and carry colour; later ones never do: the colour network skips them.
     A padding ray has status UNKNOWN and limit 0: it says nothing.
     """
 
@@ -36,7 +36,9 @@ class Observation(eqx.Module):
     range: Float[Array, "n"]  # measured distance along the ray; only read where range_valid (OBJECT pixels)
     range_sigma: Float[Array, "n"]  # standard deviation of `range`
     range_valid: Bool[Array, "n"]
-    limit: Float[Array, "n"]  # FREE and UNKNOWN: the ray was seen to be empty of the object up to here (0: says nothing)
+    limit: Float[
+        Array, "n"
+    ]  # FREE and UNKNOWN: the ray was seen to be empty of the object up to here (0: says nothing)
     pose_sigma: Float[Array, "3"]  # prior standard deviations of x, y (cube units) and log-scale of the pose
     colour_count: int = eqx.field(static=True)
 
@@ -46,7 +48,7 @@ class Observation(eqx.Module):
 
 
 class Pose(eqx.Module):
-    """Where the canonical object stands in the view frame: p_view = R_z(yaw) scale (p_object - base) + base + (x, y, 0).
+    """Where the object stands in the view frame: p_view = R_z(yaw) scale (p_object - base) + base + (x, y, 0).
 
     `base` is (0, 0, BASE_Z), so that the object stays on its plane. Leaves may carry leading batch axes.
     """

@@ -3,6 +3,7 @@
 A view camera looks roughly at the cube's centre, as the crop that `perception` makes of a real frame does.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -33,7 +34,7 @@ class ViewSet:
 
 
 def random_camera(rng: np.random.Generator) -> tuple[np.ndarray, float]:
-    """T_object_camera and the tangent of its half field of view: 5 to 75 degrees above the table, 3 to 10 units away."""
+    """T_object_camera and tangent of its half field of view: 5 to 75 degrees above the table, 3 to 10 units away."""
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(5, 75))
     distance = rng.uniform(3.0, 10.0)
     position = distance * np.array(
@@ -45,7 +46,7 @@ def random_camera(rng: np.random.Generator) -> tuple[np.ndarray, float]:
 
 
 def draw_views(
-    seeds: np.ndarray, views: int, size: int, slack: float = 1.0, progress=lambda done, total: None
+    seeds: np.ndarray, views: int, size: int, slack: float = 1.0, progress: Callable[[int, int], None] | None = None
 ) -> ViewSet:
     """Render `views` random pictures of each object; the cameras are a function of the object's seed."""
     rgb = np.zeros((len(seeds), views, size, size, 3), np.uint8)
@@ -69,7 +70,8 @@ def draw_views(
             ranges[rows, v] = np.where(np.isfinite(distance), distance, 0.0)
             transforms[rows, v] = np.stack([T for T, _ in cameras[: len(chosen)]])
             tangents[rows, v] = [f for _, f in cameras[: len(chosen)]]
-        progress(min(start + block, len(seeds)), len(seeds))
+        if progress is not None:
+            progress(min(start + block, len(seeds)), len(seeds))
     return ViewSet(seeds=np.asarray(seeds), rgb=rgb, range=ranges, T_object_camera=transforms, tan_half_fov=tangents)
 
 
@@ -80,7 +82,7 @@ def camera_rays(T_object_camera: np.ndarray, tan_half_fov: float, size: int) -> 
 
 
 def camera_features(T_object_camera: Float[Array, "4 4"], tan_half_fov: Float[Array, ""]) -> Float[Array, "13"]:
-    """What the encoder is told of a camera: its rotation, position (a fifth of it) and the tangent of its half field."""
+    """What the encoder is told of a camera: rotation, a fifth of its position, the tangent of its half field."""
     return jnp.concatenate(
         [T_object_camera[:3, :3].reshape(-1), 0.2 * T_object_camera[:3, 3], jnp.atleast_1d(tan_half_fov)]
     )
@@ -92,7 +94,7 @@ def encoder_image(
     unknown: Float[Array, "s s"],
     camera_distance: Float[Array, ""],
 ) -> Float[Array, "6 s s"]:
-    """Channels first: masked colour, object mask, unknown mask, range relative to the camera's distance from the cube."""
+    """Channels first: masked colour, object mask, unknown mask, range less the camera's distance from the cube."""
     mask = ((distance > 0.0) & (unknown < 0.5)).astype(jnp.float32)
     relative = jnp.clip(distance - camera_distance, -1.5, 1.5) * mask
     return jnp.concatenate([(jnp.moveaxis(rgb, -1, 0) - 0.5) * mask, mask[None], unknown[None], relative[None]])

@@ -39,7 +39,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "safetensors": ("probnerf/model.py",),
     "blackjax": (),  # an independent sampler to test against
     "cv2": ("calibration/*", "perception/*"),
-    "scipy": ("probnerf/occupancy.py", "probnerf/metrics.py", "perception/*", "benchmarks/*"),
+    "scipy": ("probnerf/occupancy.py", "probnerf/batches.py", "probnerf/metrics.py", "perception/*", "benchmarks/*"),
     "skimage": ("probnerf/occupancy.py", "perception/*"),
     "serial": ("calibration/turntable.py",),
     "depthai": ("perception/oak.py",),
