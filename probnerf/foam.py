@@ -48,6 +48,8 @@ def crossings(rays: Rays, lattice: Lattice, shift: Float[Array, "3"] | float = 0
     direction = jnp.where(jnp.abs(rays.direction) < 1e-9, 1e-9, rays.direction)
     t = (faces[None] - rays.origin[:, :, None]) / direction[:, :, None]  # [n, 3, planes]
     points = rays.origin[:, None, None, :] + t[..., None] * direction[:, None, None, :]
+    # across its own axis a crossing is on its face exactly: rounding must not push it off the outermost one
+    points = jnp.where(jnp.eye(3, dtype=bool)[None, :, None, :], faces[None, :, :, None], points)
     low = jnp.array([-lattice.extent, -lattice.extent, BASE_Z]) - 1e-6
     inside = jnp.all((points >= low) & (points <= lattice.extent + 1e-6), axis=-1) & (t > 0)
     t = jnp.where(inside, t, FAR).reshape(t.shape[0], -1)
@@ -64,8 +66,8 @@ def spacing(t: Float[Array, "n m"]) -> Float[Array, "n m"]:
     valid = t < FAR
     gap = jnp.where(valid[:, 1:], t[:, 1:] - t[:, :-1], 0.0)
     before = jnp.concatenate([gap[:, :1], gap], axis=-1)
-    after = jnp.concatenate([gap, jnp.zeros_like(gap[:, :1])], axis=-1)
-    after = jnp.where(after > 0, after, before)  # the last crossing has no next one
+    has_next = jnp.pad(valid[:, 1:], ((0, 0), (0, 1)))
+    after = jnp.where(has_next, jnp.pad(gap, ((0, 0), (0, 1))), before)
     return jnp.where(valid, 0.5 * (before + after), 0.0)
 
 
