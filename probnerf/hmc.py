@@ -1,13 +1,13 @@
 """Hamiltonian Monte Carlo for standard-normal latents, and the paper's annealed HMC.
 
-Symbols: q position [..., D]; v whitened momentum [..., D], a priori N(0, I); l log-likelihood; beta inverse temperature.
+Symbols: q position [..., D]; v whitened momentum [..., D] ~ N(0, I); l log-likelihood; beta inverse temperature.
 Target: N(q; 0, I) exp(beta l(q)). With mass matrix M and Omega = M^(-1/2), v = Omega p, Hamilton's equations are
 
     dq/dt = Omega v,    dv/dt = -Omega q + beta Omega grad l(q),    H = (|q|^2 + |v|^2) / 2 - beta l(q).
 
-Without the likelihood each eigenvector of Omega is a harmonic oscillator of frequency omega, solved exactly by a turn of (q, v)
-by the angle omega t. The split integrator (half kick, turn, half kick; Shahbaba et al. 2014) therefore makes an error only where
-the likelihood speaks: its step size does not shrink with the number of directions that the likelihood leaves alone.
+Without the likelihood each eigenvector of Omega is a harmonic oscillator of frequency omega, solved exactly by a turn
+of (q, v) by the angle omega t. The split integrator (half kick, turn, half kick; Shahbaba et al. 2014) makes an error
+only where the likelihood speaks: its step size does not shrink with the directions that the likelihood leaves alone.
 
 All chains run as one batch. Nothing here compiles per chain, and nothing logs inside jit.
 """
@@ -43,7 +43,9 @@ class Metric(eqx.Module):
     basis: Float[Array, "... r d"]
     frequency: Float[Array, "... r"]  # square roots of the inverse mass's eigenvalues, in (0, 1]
 
-    def apply(self, along: Float[Array, "... p r"], across: Float[Array, "... p 1"], x: Float[Array, "... p d"]) -> Array:
+    def apply(
+        self, along: Float[Array, "... p r"], across: Float[Array, "... p 1"], x: Float[Array, "... p d"]
+    ) -> Array:
         """The function of Omega with eigenvalues `along` the basis and `across` it, applied to each row of x."""
         # Full precision: the tensor cores' short floats would cost reversibility.
         inner = jnp.einsum("...pd,...rd->...pr", x, self.basis, precision="highest")
@@ -91,8 +93,8 @@ def leapfrog(
 ) -> tuple[HMCState, Float[Array, "... d"]]:
     """`steps` steps of the split integrator: half kick by the likelihood, exact turn under the prior, half kick.
 
-    `step_size` broadcasts against the leading axes; `momentum` is the whitened v. One gradient a step; volume preserving,
-    reversed by flipping the momentum.
+    `step_size` broadcasts against the leading axes; `momentum` is the whitened v. One gradient a step. The map
+    preserves volume, and flipping the momentum reverses it.
     """
     epsilon = jnp.broadcast_to(step_size, state.position.shape[:-1])[..., None]
     push = 0.5 * epsilon * jnp.broadcast_to(target.beta, epsilon.shape[:-1])[..., None]
@@ -130,7 +132,9 @@ def leapfrog(
     return state, momentum
 
 
-def energy_error(start: HMCState, v0: Array, end: HMCState, v1: Array, beta: Float[Array, "..."]) -> Float[Array, "..."]:
+def energy_error(
+    start: HMCState, v0: Array, end: HMCState, v1: Array, beta: Float[Array, "..."]
+) -> Float[Array, "..."]:
     """H(end) - H(start), summed as differences: H itself can be 10^4 while 10^-2 matters."""
     quadratic = (end.position - start.position) * (end.position + start.position) + (v1 - v0) * (v1 + v0)
     # At beta = 0 the target is the prior, and a likelihood of -inf is no obstacle.
@@ -155,12 +159,14 @@ def hmc_step(
     divergent = ~jnp.isfinite(error) | (error > MAX_ENERGY_ERROR)
     acceptance = jnp.where(divergent, 0.0, jnp.exp(-jnp.maximum(error, 0.0)))
     accepted = jax.random.uniform(accept_key, chains) < acceptance
-    state = jax.tree.map(lambda a, b: jnp.where(accepted.reshape(chains + (1,) * (a.ndim - len(chains))), a, b), end, state)
+    state = jax.tree.map(
+        lambda a, b: jnp.where(accepted.reshape(chains + (1,) * (a.ndim - len(chains))), a, b), end, state
+    )
     return state, HMCInfo(acceptance, accepted, divergent, error)
 
 
 def split_r_hat(draws: Float[np.ndarray, "chains n"]) -> float:
-    """Split R-hat (Gelman et al., BDA3 eq. 11.4) of a scalar; NaN where undefined (fewer than 4 draws, or all equal)."""
+    """Split R-hat (Gelman et al., BDA3 eq. 11.4) of a scalar; NaN where undefined (under 4 draws, all equal)."""
     half = draws.shape[1] // 2
     if half < 2 or not np.all(np.isfinite(draws)):
         return float("nan")
@@ -172,7 +178,7 @@ def split_r_hat(draws: Float[np.ndarray, "chains n"]) -> float:
 
 @dataclass(frozen=True)
 class StageInfo:
-    """Progress of a sampler after one stage; tuples have one entry per population (one entry for all of HMC's chains)."""
+    """Progress of a sampler after one stage; tuples have one entry per population (one for all of HMC's chains)."""
 
     stage: int  # from 0, which is the start
     beta: tuple[float, ...]  # inverse temperature reached; 1 is the posterior
@@ -230,13 +236,13 @@ def annealed_hmc(
     on_stage: Callable[[StageInfo], None] | None = None,
     deadline: float | None = None,
 ) -> Posterior:
-    """The paper's sampler (section 3.3): independent chains cooled from s_start to s_end, s_t = s_0^((T-t)/T) s_T^(t/T).
+    """The paper's sampler (section 3.3): independent chains cooled from s_start to s_end, s_t = s_0^(1-t/T) s_T^(t/T).
 
-    Every likelihood term is multiplied by (s_end / s_t)^2 and the step size is proportional to s_t. The kept states are the
-    last `keep` of each chain, equally weighted; all but the very last are drawn at s_t > s_end, so this is not a sample of the posterior,
-    and there is no evidence (NaN). The integrator is the split one with identity mass. `deadline` is on time.monotonic()'s
-    clock; result is "stages" when the schedule was completed, else "budget" or "interrupted" with the states at hand.
-    `point_gradients` counts gradient evaluations of whole positions.
+    Every likelihood term is multiplied by (s_end / s_t)^2 and the step size is proportional to s_t. Kept are the last
+    `keep` states of each chain, equally weighted; all but the very last are drawn at s_t > s_end, so this is no sample
+    of the posterior, and there is no evidence (NaN). The integrator is the split one with identity mass. `deadline` is
+    on time.monotonic()'s clock. result is "stages" when the schedule was completed, else "budget" or "interrupted" with
+    the states at hand. `point_gradients` counts gradient evaluations of whole positions.
     """
     config = config or AnnealedHMCConfig()
     begun = time.monotonic()
@@ -266,8 +272,8 @@ def annealed_hmc(
                 base *= float(np.exp(acceptances[-1] - config.target_acceptance))
                 base = min(base, MAX_ANNEALED_STEP / config.s_start)
             if on_stage is not None:
-                seconds, nan = time.monotonic() - begun, (float("nan"),)
-                on_stage(StageInfo(t, (beta,), nan, (acceptances[-1],), (step,), nan, divergences, seconds))
+                none, seconds = (float("nan"),), time.monotonic() - begun
+                on_stage(StageInfo(t, (beta,), none, (acceptances[-1],), (step,), none, divergences, seconds))
     except KeyboardInterrupt:
         result = "interrupted"
 

@@ -1,14 +1,15 @@
 """Tempered sequential Monte Carlo: weighted samples and an evidence estimate for standard-normal latents.
 
-Independent populations of particles go from the prior (beta = 0) to the posterior (beta = 1). A *round* is one HMC iteration
-of every particle; a *stage* is some rounds at the present beta, then a step of beta that keeps the conditional effective
-sample size (Zhou, Johansen, Aston 2016), the particles' incremental weights L^(step of beta), and systematic resampling.
-The product of the mean incremental weights estimates the evidence (Del Moral, Doucet, Jasra 2006).
+Independent populations of particles go from the prior (beta = 0) to the posterior (beta = 1). A *stage* makes `moves`
+HMC iterations of every particle at the present beta; the states after each of them form the population's *pool* (no
+move is wasted: waste-free SMC, Dau and Chopin 2022). Then beta takes the longest step that keeps the effective sample
+size of the pool under the weights L^(step) (conditional ESS, Zhou, Johansen and Aston 2016), and systematic resampling
+draws the next particles from it. The product of the mean weights estimates the evidence.
 
-Everything that tunes one population's moves (metric, step size) is read off its neighbour population, never off the states that
-are about to move. The metric is M = I + Cov(beta grad l) over the neighbour's particles: for a Gaussian likelihood of precision K the
-covariance is K (beta^-1 + K)^-1 K beta ~ beta K in every stiff direction, and exactly 0 in the directions that the likelihood leaves to the
-prior. It needs no more particles than there are stiff directions, whatever the dimension.
+What tunes one population's moves (metric, step size) is read off its neighbour, never off the states about to move. The
+metric is M = I + Cov(beta grad l) over the neighbour's weighted pool. For a Gaussian likelihood of precision K that is
+I + beta^2 K (I + beta K)^-1 K: about the posterior's precision I + beta K in every stiff direction, and exactly the
+prior's where the likelihood says nothing. It needs no more particles than there are stiff directions, in any dimension.
 """
 
 import time
@@ -30,17 +31,17 @@ from probnerf.types import Diagnostics, Posterior
 
 @dataclass(frozen=True)
 class TemperedSMCConfig:
-    """Sizes and targets. All but the counts of rounds that the host keeps are compiled in."""
+    """Sizes and targets; all are compiled in."""
 
     populations: int = 2  # independent runs: their spread is the Monte Carlo error
-    particles: int = 64  # per population
-    start_particles: int = 256  # drawn from the prior per population for the first importance step (at least `particles`)
-    ess_target: float = 0.5  # conditional effective sample size after each step of beta, as a fraction of `particles`
-    moves: int = 2  # HMC iterations a stage
-    leapfrog_steps: int = 8
+    particles: int = 64  # per population; populations * particles positions are evaluated at a time
+    start_particles: int = 256  # drawn from the prior per population for the first importance step
+    ess_target: float = 0.5  # effective sample size kept by each step of beta, as a fraction of the pool
+    moves: int = 4  # HMC iterations a stage: a population's pool has moves * particles states
+    leapfrog_steps: int = 4
     target_acceptance: float = 0.8
-    final_rounds: int = 4  # stages at beta = 1
-    keep: int = 4  # the last of them whose states become samples
+    final_stages: int = 2  # at beta = 1
+    keep: int = 2  # the last of them, whose pools become the samples
     max_stages: int = 200
 
     def __post_init__(self) -> None:
@@ -50,52 +51,57 @@ class TemperedSMCConfig:
             raise ValueError(
                 f"TemperedSMCConfig: start_particles {self.start_particles} must be at least particles {self.particles}"
             )
-        if not 0 < self.ess_target < 1:
-            raise ValueError(f"TemperedSMCConfig: ess_target {self.ess_target} must lie between 0 and 1")
-        if not 1 <= self.keep <= self.final_rounds:
-            raise ValueError(f"TemperedSMCConfig: keep {self.keep} must lie between 1 and final_rounds {self.final_rounds}")
+        if not (0 < self.ess_target < 1 and 0 < self.target_acceptance < 1):
+            raise ValueError("TemperedSMCConfig: ess_target and target_acceptance must lie between 0 and 1")
+        if not 1 <= self.keep <= self.final_stages:
+            raise ValueError(
+                f"TemperedSMCConfig: keep {self.keep} must lie between 1 and final_stages {self.final_stages}"
+            )
 
     @property
     def longest_step(self) -> float:
-        """A quarter turn a trajectory: where the metric is right every direction has period 2 pi, and more undoes itself."""
+        """A quarter turn a trajectory: under the right metric all periods are 2 pi, and more undoes itself."""
         return 0.5 * np.pi / self.leapfrog_steps
 
 
 class _State(eqx.Module):
-    chain: HMCState  # [populations, particles, ...]
+    """m populations of p particles, resampled at beta and not yet moved there."""
+
+    chain: HMCState
     beta: Float[Array, "m"]
     log_evidence: Float[Array, "m"]  # of the target at beta
+    variance: Float[Array, "m"]  # of log_evidence, were all particles of a pool independent: sum of 1 / ESS - 1 / size
     ancestor: Int[Array, "m p"]  # index of the initial particle
     step_size: Float[Array, "m"]
+    metric: Metric  # with a leading axis m
 
 
 class _Info(eqx.Module):
     ess: Float[Array, "m"]
-    acceptance: Float[Array, "m"]
-    step_size: Float[Array, "m"]  # the one used last
+    acceptance: Float[Array, "m"]  # mean over the stage
+    step_size: Float[Array, "m"]  # the last one used
     divergences: Int[Array, ""]
 
 
 def log_prior(q: Float[Array, "... d"]) -> Float[Array, "..."]:
-    """Log-density of N(0, I) at q."""
+    """Log-density of N(0, I) at q, nats."""
     return -0.5 * jnp.sum(q * q + jnp.log(2 * jnp.pi), axis=-1)
-
-
-def _ess(log_w: Float[Array, "... n"]) -> Float[Array, "..."]:
-    """Effective sample size of unnormalised weights, 0 if all are 0."""
-    top = jnp.max(log_w, axis=-1, keepdims=True)
-    w = jnp.exp(log_w - jnp.where(jnp.isfinite(top), top, 0.0))
-    return jnp.sum(w, axis=-1) ** 2 / jnp.maximum(jnp.sum(w * w, axis=-1), 1e-30)
 
 
 # Fractions of the remaining way to beta = 1, 40 a decade. A grid, as the ESS need not fall with beta under proposals.
 _FRACTIONS = np.geomspace(1e-9, 1.0, 361).astype(np.float32)
 
 
-def _next_beta(beta, log_w, log_likelihood, target):
-    """The largest beta of the grid at which the weights exp(log_w) L^(step) keep the ESS, and those weights' logarithms.
+def _ess(log_w: Float[Array, "n"]) -> Float[Array, ""]:
+    top = jnp.max(log_w)
+    w = jnp.exp(log_w - jnp.where(jnp.isfinite(top), top, 0.0))
+    return jnp.sum(w) ** 2 / jnp.maximum(jnp.sum(w * w), 1e-30)  # 0 if all weights are
 
-    Where none keeps it (dead particles, poor proposals) the one of the largest ESS; without any live particle beta becomes 1.
+
+def _next_beta(beta, log_w, log_likelihood, enough):
+    """The largest beta at which the weights exp(log_w) L^step have ESS `enough`; their logarithms; their ESS.
+
+    Where none has (dead particles, poor proposals), the beta of the largest ESS; with no live particle at all, 1.
     """
 
     def weights(step):
@@ -103,10 +109,10 @@ def _next_beta(beta, log_w, log_likelihood, target):
 
     steps = (1.0 - beta) * _FRACTIONS
     ess = jax.vmap(lambda step: _ess(weights(step)))(steps)
-    enough = ess >= target
-    index = jnp.where(jnp.any(enough), ess.size - 1 - jnp.argmax(enough[::-1]), jnp.argmax(ess))
-    index = jnp.where(jnp.any(jnp.isfinite(log_likelihood)), index, ess.size - 1)
-    new = jnp.where(index == ess.size - 1, 1.0, beta + steps[index])  # beta + (1 - beta) need not be 1 in float32
+    last = ess.size - 1
+    index = jnp.where(jnp.any(ess >= enough), last - jnp.argmax((ess >= enough)[::-1]), jnp.argmax(ess))
+    index = jnp.where(jnp.any(jnp.isfinite(log_likelihood)), index, last)
+    new = jnp.where(index == last, 1.0, beta + steps[index])  # in float32 beta + (1 - beta) need not be 1
     return new, weights(new - beta), ess[index]
 
 
@@ -119,12 +125,30 @@ def _resample(key, log_w, count: int):
     return jnp.searchsorted(total / total[-1], u, side="right")
 
 
-def _metric(gradient: Float[Array, "p d"], beta: Float[Array, ""]) -> Metric:
-    """Omega = (I + Cov(beta grad l))^(-1/2), from the thin singular value decomposition of the particles' gradients."""
+def _choose(key, log_w, pool, count: int):
+    """`count` particles of each population's weighted pool, resampled."""
+    keys = jax.random.split(key, log_w.shape[0])
+    index = jax.vmap(lambda k, w: _resample(k, w, count))(keys, log_w)
+    return jax.vmap(lambda tree, i: jax.tree.map(lambda a: a[i], tree))(pool, index)
+
+
+def _metric(gradient: Float[Array, "n d"], log_w: Float[Array, "n"], beta: Float[Array, ""], rank: int) -> Metric:
+    """Omega = (I + Cov(beta grad l))^(-1/2), from the thin singular value decomposition of the weighted gradients."""
+    weight = jnp.exp(log_w - logsumexp(log_w))
+    weight = jnp.where(jnp.isfinite(weight), weight, 0.0)
     # An overflow here would poison a whole population; a slope of 10^12 pins its direction as well as any.
     g = beta * jnp.clip(gradient, -1e12, 1e12)
-    _, s, basis = jnp.linalg.svd((g - jnp.mean(g, axis=0)) / np.sqrt(g.shape[0]), full_matrices=False)
-    return Metric(basis, 1.0 / jnp.sqrt(1.0 + s * s))
+    g = jnp.sqrt(weight)[:, None] * (g - weight @ g)
+    g = jnp.pad(g, ((0, max(0, rank - len(g))), (0, 0)))
+    _, s, basis = jnp.linalg.svd(g, full_matrices=False)
+    return Metric(basis[:rank], 1.0 / jnp.sqrt(1.0 + s[:rank] ** 2))
+
+
+def _metrics(gradient, log_w, beta, config: TemperedSMCConfig) -> Metric:
+    """Each population's metric, from the weighted pool of the population before it."""
+    rank = min(config.moves * config.particles, gradient.shape[-1])
+    gradient, log_w = jnp.roll(gradient, 1, axis=0), jnp.roll(log_w, 1, axis=0)
+    return jax.vmap(lambda g, w, b: _metric(g, w, b, rank))(gradient, log_w, beta)
 
 
 @partial(jax.jit, static_argnames=("log_likelihood", "config"))
@@ -132,57 +156,66 @@ def _start(key, args, q0, log_w0, *, log_likelihood: LogLikelihood, config: Temp
     """Importance step from q0 [m, p0, d] with weights exp(log_w0) = prior / proposal to the first beta > 0."""
     populations, count, dim = q0.shape
     chunks = -(-count // config.particles)
-    padded = jnp.concatenate([q0, jnp.zeros((populations, chunks * config.particles - count, dim))], axis=1)
+    padded = jnp.pad(q0, ((0, 0), (0, chunks * config.particles - count), (0, 0)))
     padded = padded.reshape(populations, chunks, config.particles, dim).swapaxes(0, 1)
-    pool = jax.lax.map(Target(log_likelihood, args, jnp.zeros(())).evaluate, padded)  # as wide as any later evaluation
+    # Chunks as wide as every later evaluation, so that a large start takes no more memory.
+    pool = jax.lax.map(Target(log_likelihood, args, jnp.zeros(())).evaluate, padded)
     pool = jax.tree.map(lambda a: a.swapaxes(0, 1).reshape(populations, -1, *a.shape[3:])[:, :count], pool)
 
-    log_w0 = jnp.where(jnp.isfinite(log_w0), log_w0, -jnp.inf)
     value = jnp.where(jnp.isfinite(log_w0), pool.log_likelihood, -jnp.inf)
-    target = config.ess_target * config.particles
-    beta, log_w, ess = jax.vmap(lambda w, value: _next_beta(jnp.zeros(()), w, value, target))(log_w0, value)
-    index = jax.vmap(lambda k, w: _resample(k, w, config.particles))(jax.random.split(key, populations), log_w)
+    enough = config.ess_target * config.particles  # a number, so that a larger start buys a longer first step
+    beta, log_w, ess = jax.vmap(lambda w, v: _next_beta(jnp.zeros(()), w, v, enough))(log_w0, value)
+    ancestor = jnp.broadcast_to(jnp.arange(count), log_w.shape)
+    chain, ancestor = _choose(key, log_w, (pool, ancestor), config.particles)
     state = _State(
-        chain=jax.vmap(lambda tree, i: jax.tree.map(lambda a: a[i], tree))(pool, index),
+        chain=chain,
         beta=beta,
         log_evidence=logsumexp(log_w, axis=1) - np.log(count),
-        ancestor=index,
+        variance=1.0 / ess - 1.0 / count,
+        ancestor=ancestor,
         step_size=jnp.full(populations, config.longest_step),
+        metric=_metrics(pool.gradient, log_w, beta, config),
     )
-    unmoved = jnp.full(populations, jnp.nan)
-    return state, _Info(ess, unmoved, state.step_size, jnp.zeros((), jnp.int32))
+    return state, _Info(ess, jnp.full(populations, jnp.nan), state.step_size, jnp.zeros((), jnp.int32))
 
 
 @partial(jax.jit, static_argnames=("log_likelihood", "config"))
 def _stage(key, state: _State, args, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig):
-    """`moves` rounds at the present beta, then the step to the next beta (none at 1) and resampling."""
-    beta = state.beta
+    """`moves` iterations at the present beta, then the step to the next beta and resampling (at beta = 1: neither)."""
+    target = Target(log_likelihood, args, state.beta[:, None], state.metric)
 
-    def round_(carry, key):
+    def move(carry, key):
         chain, step = carry
-        metric = jax.vmap(_metric)(jnp.roll(chain.gradient, 1, axis=0), beta)
-        target = Target(log_likelihood, args, beta[:, None], metric)
         chain, info = hmc_step(key, chain, target, step[:, None], config.leapfrog_steps)
         acceptance = jnp.mean(info.acceptance, axis=1)
         tuned = jnp.minimum(step * jnp.exp(2.0 * (acceptance - config.target_acceptance)), config.longest_step)
-        return (chain, jnp.roll(tuned, 1)), (acceptance, step, jnp.sum(info.divergent))
+        return (chain, jnp.roll(tuned, 1)), (chain, acceptance, step, jnp.sum(info.divergent))
 
     move_key, resample_key = jax.random.split(key)
-    (chain, step), (acceptance, used, divergences) = jax.lax.scan(
-        round_, (state.chain, state.step_size), jax.random.split(move_key, config.moves)
+    (chain, step), (pool, acceptance, steps, divergences) = jax.lax.scan(
+        move, (state.chain, state.step_size), jax.random.split(move_key, config.moves)
     )
-
-    flat = jnp.zeros(config.particles)
-    target = config.ess_target * config.particles
-    new_beta, log_w, ess = jax.vmap(lambda b, value: _next_beta(b, flat, value, target))(beta, chain.log_likelihood)
-    index = jax.vmap(lambda k, w: _resample(k, w, config.particles))(jax.random.split(resample_key, beta.size), log_w)
-    moving = beta < 1
-    index = jnp.where(moving[:, None], index, jnp.arange(config.particles))  # equal weights: nothing to resample
-    chain, ancestor = jax.vmap(lambda tree, i: jax.tree.map(lambda a: a[i], tree))((chain, state.ancestor), index)
-    gain = jnp.where(moving, logsumexp(log_w, axis=1) - np.log(config.particles), 0.0)
-    state = _State(chain, jnp.where(moving, new_beta, 1.0), state.log_evidence + gain, ancestor, step)
-    ess = jnp.where(moving, ess, jnp.nan)
-    return state, _Info(ess, jnp.mean(acceptance, axis=0), used[-1], jnp.sum(divergences))
+    # [moves, m, p, ...] -> [m, moves p, ...]
+    pool = jax.tree.map(lambda a: a.swapaxes(0, 1).reshape(config.populations, -1, *a.shape[3:]), pool)
+    size = config.moves * config.particles
+    beta, log_w, ess = jax.vmap(lambda b, v: _next_beta(b, jnp.zeros(size), v, config.ess_target * size))(
+        state.beta, pool.log_likelihood
+    )
+    ancestor = jnp.tile(state.ancestor, (1, config.moves))
+    chosen = _choose(resample_key, log_w, (pool, ancestor), config.particles)
+    tempering = state.beta < 1
+    chain, ancestor = jax.tree.map(
+        lambda a, b: jnp.where(tempering.reshape(-1, *[1] * (a.ndim - 1)), a, b), chosen, (chain, state.ancestor)
+    )
+    log_evidence = jnp.where(
+        tempering, state.log_evidence + logsumexp(log_w, axis=1) - np.log(size), state.log_evidence
+    )
+    variance = jnp.where(tempering, state.variance + 1.0 / ess - 1.0 / size, state.variance)
+    beta = jnp.where(tempering, beta, 1.0)
+    metric = _metrics(pool.gradient, log_w, beta, config)
+    state = _State(chain, beta, log_evidence, variance, ancestor, step, metric)
+    info = _Info(jnp.where(tempering, ess, jnp.nan), jnp.mean(acceptance, axis=0), steps[-1], jnp.sum(divergences))
+    return state, info, pool
 
 
 @partial(jax.jit, static_argnames=("shape",))
@@ -207,20 +240,21 @@ def tempered_smc(
     deadline: float | None = None,
     stages: int | None = None,
 ) -> Posterior:
-    """Samples N(q; 0, I) L(q) by adaptive tempered SMC, with an evidence estimate.
+    """Samples N(q; 0, I) L(q) by adaptive tempered SMC, with an estimate of its integral, the evidence.
 
-    `initial` are positions drawn from any density that covers the prior (a defensive mixture of prior and encoder, say) and their
-    log-density; None draws `start_particles` from the prior. `deadline` is on time.monotonic()'s clock, no stage is begun that would
-    overrun it by the shortest stage so far; `stages` caps their number, and without a deadline the answer depends on key and
-    stages alone. A start is always made.
+    `initial` are positions drawn from any density that covers the prior (say a defensive mixture of prior and encoder)
+    and the logarithm of that density there; None draws `start_particles` from the prior. `deadline` is on the clock of
+    time.monotonic(): no stage is begun that would pass it even if as short as the shortest so far. `stages` caps their
+    number. Without a deadline the answer depends on key and stages alone. The start is always made.
 
-    The samples are all particles of the last `keep` rounds; a population's share of the weight is its evidence estimate, which
-    makes weighted averages consistent when populations found different modes. log_evidence is the log of the mean estimate, its error the
-    relative standard error of that mean (NaN for one population). Populations touch only through tuning.
+    The samples are the pools of the last `keep` stages. A population's share of the weight is its evidence estimate, so
+    that weighted averages stay consistent when populations found different modes. log_evidence is the logarithm of the
+    mean estimate; its error is the larger of two, one from the populations' spread (which is chance with only two) and
+    one from the weights' variance stage by stage (which knows nothing of a mode that all particles missed).
 
-    result: "converged" (beta = 1 and all final rounds), else "budget", "stages" or "interrupted" (Ctrl-C). Stopped before beta = 1 the particles
-    are equally weighted draws of the *tempered* target (too wide, never falsely certain) and log_evidence is NaN.
-    `point_gradients` counts gradient evaluations of whole positions.
+    result: "converged" (beta = 1 and all final stages), else "budget", "stages" or "interrupted" (Ctrl-C). A run
+    stopped before beta = 1 hands back equally weighted draws of the tempered target, which is wider than the posterior,
+    and NaN for the evidence. `point_gradients` counts gradient evaluations of whole positions.
     """
     config = config or TemperedSMCConfig()
     begun = time.monotonic()
@@ -232,27 +266,27 @@ def tempered_smc(
     state, info = _start(start_key, args, q0, log_w0, log_likelihood=log_likelihood, config=config)
 
     gradients = float(q0.shape[0] * q0.shape[1])
-    kept: list[HMCState] = []  # states after each final round
-    cap, done, divergences, shortest, acceptance, result = stages, 0, 0, 0.0, float("nan"), "converged"
+    kept: list[HMCState] = []  # the pools of the final stages
     cap = config.max_stages if stages is None else min(stages, config.max_stages)
+    done, divergences, shortest, acceptance, result = 0, 0, 0.0, float("nan"), "converged"
     try:
         while True:
             divergences += int(info.divergences)
             if on_stage is not None:
                 on_stage(_progress(done, state, info, divergences, time.monotonic() - begun))
-            if len(kept) == config.final_rounds:
+            if len(kept) == config.final_stages:
                 break
             now = time.monotonic()
             if done >= cap or (deadline is not None and now + shortest > deadline):
                 result = "stages" if done >= cap else "budget"
                 break
             final = bool(np.all(np.asarray(state.beta) == 1.0))
-            state, info = _stage(
+            state, info, pool = _stage(
                 jax.random.fold_in(key, done), state, args, log_likelihood=log_likelihood, config=config
             )
             acceptance = float(np.mean(np.asarray(info.acceptance)))  # waits for the device
             if final:
-                kept = [*kept, state.chain]
+                kept = [*kept, pool]
             done += 1
             seconds = time.monotonic() - now
             shortest = seconds if done == 1 else min(shortest, seconds)
@@ -270,41 +304,49 @@ def _checked(initial, config: TemperedSMCConfig, dim: int):
             f"[{config.populations} populations, at least {config.particles} particles, {dim}]"
         )
     if log_q0.shape != q0.shape[:2]:
-        raise ValueError(f"initial log-densities have shape {log_q0.shape}; positions want {q0.shape[:2]}")
+        raise ValueError(f"initial log-densities have shape {log_q0.shape}; the positions want {q0.shape[:2]}")
     return q0, log_q0
 
 
 def _progress(stage: int, state: _State, info: _Info, divergences: int, seconds: float) -> StageInfo:
-    def row(a):
+    def row(a) -> tuple[float, ...]:
         return tuple(np.asarray(a).tolist())
 
     return StageInfo(
-        stage, row(state.beta), row(info.ess), row(info.acceptance), row(info.step_size), row(state.log_evidence),
-        divergences, seconds,
-    )  # fmt: skip
+        stage=stage,
+        beta=row(state.beta),
+        ess=row(info.ess),
+        acceptance=row(info.acceptance),
+        step_size=row(info.step_size),
+        log_evidence=row(state.log_evidence),
+        divergences=divergences,
+        seconds=seconds,
+    )
 
 
 def _posterior(state: _State, kept: list[HMCState], acceptance, divergences, stages, gradients, result) -> Posterior:
-    # NumPy: the number of kept rounds varies, and nothing may compile for it.
-    positions = np.stack([np.asarray(chain.position) for chain in kept])  # [rounds, m, p, d]
+    # NumPy: the number of kept pools varies, and nothing may compile for it.
+    positions = np.stack([np.asarray(chain.position) for chain in kept])  # [kept, m, n, d]
     values = np.stack([np.asarray(chain.log_likelihood) for chain in kept])
-    rounds, populations, particles = values.shape
-    complete = bool(np.all(np.asarray(state.beta) == 1.0))
+    populations = values.shape[1]
     estimates = np.asarray(state.log_evidence, np.float64)
     log_evidence = error = float("nan")
     share = np.full(populations, -np.log(populations))
-    if complete:
+    if np.all(np.asarray(state.beta) == 1.0):
         log_evidence = float(np.logaddexp.reduce(estimates) - np.log(populations))
     if np.isfinite(log_evidence):
-        share = estimates - np.logaddexp.reduce(estimates)
-        if populations > 1:
-            error = float(np.std(np.exp(estimates - log_evidence), ddof=1) / np.sqrt(populations))
-    log_weights = np.broadcast_to((share - np.log(rounds * particles))[None, :, None], values.shape).ravel()
+        share = share + estimates - log_evidence
+        ratio = np.exp(estimates - log_evidence)
+        spread = np.std(ratio, ddof=1) / np.sqrt(populations) if populations > 1 else 0.0
+        within = np.sqrt(np.sum(ratio**2 * np.asarray(state.variance))) / populations
+        error = float(max(spread, within))
+    log_weights = np.broadcast_to((share - np.log(values.size / populations))[None, :, None], values.shape).ravel()
+    population = np.broadcast_to(np.arange(populations, dtype=np.int32)[None, :, None], values.shape).ravel()
     return Posterior(
         positions=jnp.asarray(positions.reshape(-1, positions.shape[-1])),
         log_weights=jnp.asarray(log_weights.astype(np.float32)),
         log_likelihoods=jnp.asarray(values.ravel()),
-        population=jnp.asarray(np.broadcast_to(np.arange(populations, dtype=np.int32)[None, :, None], values.shape).ravel()),
+        population=jnp.asarray(population),
         log_evidence=jnp.asarray(np.float32(log_evidence)),
         log_evidence_se=jnp.asarray(np.float32(error)),
         diagnostics=Diagnostics(
