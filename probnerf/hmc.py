@@ -52,6 +52,25 @@ class Metric(eqx.Module):
         return across * x + jnp.einsum("...pr,...rd->...pd", (along - across) * inner, self.basis, precision="highest")
 
 
+def gradient_metric(
+    gradient: Float[Array, "n d"], log_w: Float[Array, "n"], beta: Float[Array, ""], rank: int
+) -> Metric:
+    """M = I + Cov(beta grad l) over weighted draws, to `rank` directions, from a thin singular value decomposition.
+
+    For a Gaussian likelihood of precision K and draws of the target this is I + beta^2 K (I + beta K)^-1 K: about the
+    target's precision I + beta K in every stiff direction, and exactly the prior's where the likelihood says nothing.
+    It needs no more draws than there are stiff directions, in any dimension.
+    """
+    weight = jnp.exp(log_w - jax.scipy.special.logsumexp(log_w))
+    weight = jnp.where(jnp.isfinite(weight), weight, 0.0)
+    # An overflow here would poison a whole population; a slope of 10^12 pins its direction as well as any.
+    g = beta * jnp.clip(gradient, -1e12, 1e12)
+    g = jnp.sqrt(weight)[:, None] * (g - weight @ g)
+    g = jnp.pad(g, ((0, max(0, rank - len(g))), (0, 0)))
+    _, s, basis = jnp.linalg.svd(g, full_matrices=False)
+    return Metric(basis[:rank], 1.0 / jnp.sqrt(1.0 + s[:rank] ** 2))
+
+
 class Target(eqx.Module):
     """N(q; 0, I) exp(beta l(args, q)), seen through a metric (None: the identity)."""
 
@@ -149,16 +168,17 @@ def hmc_step(
 
     A trajectory whose energy error is not finite or exceeds MAX_ENERGY_ERROR is divergent and rejected.
     """
-    momentum_key, jitter_key, accept_key = jax.random.split(key, 3)
+    momentum_key, uniform_key = jax.random.split(key)
     momentum = jax.random.normal(momentum_key, state.position.shape)
     chains = state.log_likelihood.shape
-    jitter = jax.random.uniform(jitter_key, chains, minval=JITTER[0], maxval=JITTER[1])
+    uniform = jax.random.uniform(uniform_key, (2, *chains))
+    jitter = JITTER[0] + (JITTER[1] - JITTER[0]) * uniform[0]
     end, end_momentum = leapfrog(state, momentum, target, step_size * jitter, steps)
 
     error = energy_error(state, momentum, end, end_momentum, target.beta)
     divergent = ~jnp.isfinite(error) | (error > MAX_ENERGY_ERROR)
     acceptance = jnp.where(divergent, 0.0, jnp.exp(-jnp.maximum(error, 0.0)))
-    accepted = jax.random.uniform(accept_key, chains) < acceptance
+    accepted = uniform[1] < acceptance
     state = jax.tree.map(
         lambda a, b: jnp.where(accepted.reshape(chains + (1,) * (a.ndim - len(chains))), a, b), end, state
     )

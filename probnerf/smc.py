@@ -6,10 +6,7 @@ move is wasted: waste-free SMC, Dau and Chopin 2022). Then beta takes the longes
 size of the pool under the weights L^(step) (conditional ESS, Zhou, Johansen and Aston 2016), and systematic resampling
 draws the next particles from it. The product of the mean weights estimates the evidence.
 
-What tunes one population's moves (metric, step size) is read off its neighbour, never off the states about to move. The
-metric is M = I + Cov(beta grad l) over the neighbour's weighted pool. For a Gaussian likelihood of precision K that is
-I + beta^2 K (I + beta K)^-1 K: about the posterior's precision I + beta K in every stiff direction, and exactly the
-prior's where the likelihood says nothing. It needs no more particles than there are stiff directions, in any dimension.
+What tunes one population's moves (metric, step size) is read off its neighbour, never off the states about to move.
 """
 
 import time
@@ -25,7 +22,7 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from probnerf.hmc import HMCState, LogLikelihood, Metric, StageInfo, Target, hmc_step, split_r_hat
+from probnerf.hmc import HMCState, LogLikelihood, Metric, StageInfo, Target, gradient_metric, hmc_step, split_r_hat
 from probnerf.types import Diagnostics, Posterior
 
 
@@ -132,23 +129,11 @@ def _choose(key, log_w, pool, count: int):
     return jax.vmap(lambda tree, i: jax.tree.map(lambda a: a[i], tree))(pool, index)
 
 
-def _metric(gradient: Float[Array, "n d"], log_w: Float[Array, "n"], beta: Float[Array, ""], rank: int) -> Metric:
-    """Omega = (I + Cov(beta grad l))^(-1/2), from the thin singular value decomposition of the weighted gradients."""
-    weight = jnp.exp(log_w - logsumexp(log_w))
-    weight = jnp.where(jnp.isfinite(weight), weight, 0.0)
-    # An overflow here would poison a whole population; a slope of 10^12 pins its direction as well as any.
-    g = beta * jnp.clip(gradient, -1e12, 1e12)
-    g = jnp.sqrt(weight)[:, None] * (g - weight @ g)
-    g = jnp.pad(g, ((0, max(0, rank - len(g))), (0, 0)))
-    _, s, basis = jnp.linalg.svd(g, full_matrices=False)
-    return Metric(basis[:rank], 1.0 / jnp.sqrt(1.0 + s[:rank] ** 2))
-
-
 def _metrics(gradient, log_w, beta, config: TemperedSMCConfig) -> Metric:
     """Each population's metric, from the weighted pool of the population before it."""
     rank = min(config.moves * config.particles, gradient.shape[-1])
     gradient, log_w = jnp.roll(gradient, 1, axis=0), jnp.roll(log_w, 1, axis=0)
-    return jax.vmap(lambda g, w, b: _metric(g, w, b, rank))(gradient, log_w, beta)
+    return jax.vmap(lambda g, w, b: gradient_metric(g, w, b, rank))(gradient, log_w, beta)
 
 
 @partial(jax.jit, static_argnames=("log_likelihood", "config"))
