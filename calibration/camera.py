@@ -59,7 +59,8 @@ class Camera:
         if self.distortion.any():
             xy = cv2.undistortPoints(px, self.K, self.distortion, criteria=_CRITERIA).reshape(-1, 2)
         else:  # exact, and the skew is honoured, which OpenCV ignores
-            xy = np.linalg.solve(self.K, np.column_stack([px.reshape(-1, 2), np.ones(len(px))]).T).T[:, :2]
+            xy = (px.reshape(-1, 2) - self.K[:2, 2]) / [self.K[0, 0], self.K[1, 1]]
+            xy[:, 0] -= self.K[0, 1] / self.K[0, 0] * xy[:, 1]
         rays = np.column_stack([xy, np.ones(len(xy))])
         rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         if self.distortion.any():  # OpenCV answers even where its iteration diverged

@@ -29,6 +29,12 @@ def test_project_inverts_rays(lens: str) -> None:
     np.testing.assert_allclose(camera(lens).project(rays * depth), pixels, atol=1e-3)
 
 
+def test_skew_is_honoured() -> None:
+    skewed = Camera(640, 480, K + np.array([[0.0, 7.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.zeros(5))
+    pixels = np.random.default_rng(0).uniform(0, 480, (50, 2))
+    np.testing.assert_allclose(skewed.project(skewed.rays(pixels)), pixels, atol=1e-9)
+
+
 def test_the_axis_looks_forward_and_y_is_down() -> None:
     rays = camera().rays(np.array([[318.5, 243.2], [318.5, 400.0], [500.0, 243.2]]))
     np.testing.assert_allclose(rays[0], [0, 0, 1], atol=1e-12)

@@ -1,0 +1,100 @@
+"""The plane that things stand on, found in a frame's points."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import ConvexHull, QhullError
+
+
+@dataclass(frozen=True)
+class PlaneConfig:
+    """Lengths in metres."""
+
+    tolerance: float = 0.008  # half thickness of the slab that counts as the plane
+    lowest: float = 0.016  # what stands on a plane has points at heights between these
+    highest: float = 0.5
+    triplets: int = 1000  # planes tried
+    seed: int = 0
+
+
+def heights(points: Float[np.ndarray, "... 3"], plane: Float[np.ndarray, "4"]) -> Float[np.ndarray, "..."]:
+    """Signed distance of points to a plane (m), positive above."""
+    return points @ plane[:3] + plane[3]
+
+
+def support_plane(
+    points: Float[np.ndarray, "h w 3"], config: PlaneConfig
+) -> tuple[Float[np.ndarray, "4"], Bool[np.ndarray, "h w"]]:
+    """The plane (n, d) that things stand on and its pixels.
+
+    RANSAC over triplets of points up to a quarter of the picture apart, three planes one after the other, each refitted
+    to its inliers by total least squares. The most pixels win, where a plane that leans away from the picture's upward
+    direction (a wall) counts a quarter, and one with nothing standing on it (the floor, a box's top) a tenth.
+    Raises `ValueError` where no plane holds a twentieth of the points.
+    """
+    rng = np.random.default_rng(config.seed)
+    size = np.array(points.shape[:2])
+    pixels = np.argwhere(np.isfinite(points[..., 2]))
+    pixels = pixels[rng.permutation(len(pixels))[:20_000]]
+    cloud = points[pixels[:, 0], pixels[:, 1]]
+    free = np.ones(len(cloud), bool)  # not yet on a plane
+    best, best_score = None, 0.0
+    for _ in range(3):
+        if free.sum() < max(3, 0.05 * len(cloud)):
+            break
+        seeds = pixels[rng.choice(np.flatnonzero(free), config.triplets)]
+        corners = [points[seeds[:, 0], seeds[:, 1]]]
+        for _ in range(2):
+            near = np.clip(seeds + rng.integers(-size // 4, size // 4 + 1, seeds.shape), 0, size - 1)
+            corners.append(points[near[:, 0], near[:, 1]])
+        normals = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+        length = np.linalg.norm(normals, axis=1)
+        usable = length > 1e-9  # false for NaN corners too
+        normals, origins = normals[usable] / length[usable, None], corners[0][usable]
+        if not len(normals):
+            continue
+        sparse = cloud[free][:2000]
+        distance = np.abs(sparse @ normals.T - np.einsum("ij,ij->i", normals, origins))
+        at = int((distance < config.tolerance).sum(axis=0).argmax())
+        plane = np.append(normals[at], -normals[at] @ origins[at])
+        for _ in range(4):
+            on = free & (np.abs(heights(cloud, plane)) < config.tolerance)
+            if on.sum() < 3:
+                break
+            centre = cloud[on].mean(axis=0)
+            normal = np.linalg.eigh(np.cov((cloud[on] - centre).T))[1][:, 0]
+            plane = np.append(normal, -normal @ centre)
+        plane *= np.sign(plane[3]) or 1.0  # the camera is on the upper side
+        share = on.mean()
+        free &= ~on
+        if share < 0.05:
+            continue
+        height = heights(cloud, plane)
+        standing = over(cloud, plane, cloud[on], -0.02) & (height > config.lowest) & (height < config.highest)
+        score = share * (1.0 if -plane[1] > 0.1 else 0.25) * (1.0 if standing.mean() > 0.005 else 0.1)
+        if score > best_score:
+            best, best_score = plane, score
+    if best is None:
+        raise ValueError("no support plane was found; show more of the table, or check the depth and its unit")
+    return best, np.abs(heights(points, best)) < config.tolerance
+
+
+def horizontal(plane: Float[np.ndarray, "4"]) -> Float[np.ndarray, "2 3"]:
+    """Two unit vectors that span a plane."""
+    first = np.cross(plane[:3], np.eye(3)[np.abs(plane[:3]).argmin()])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(plane[:3], first)])
+
+
+def over(
+    points: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, "4"], on: Float[np.ndarray, "m 3"], margin: float = 0.01
+) -> Bool[np.ndarray, "n"]:
+    """Which points are over (or under) the convex hull of points on a plane, grown by `margin` (m)."""
+    axes = horizontal(plane)
+    try:
+        edges = ConvexHull(on @ axes.T).equations.astype(np.float32)
+    except (QhullError, ValueError):  # too few points, or all in a line
+        return np.zeros(len(points), bool)
+    flat = (points @ axes.T).astype(np.float32)
+    return (flat @ edges[:, :2].T + edges[:, 2]).max(axis=1) <= margin
