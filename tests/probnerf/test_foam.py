@@ -61,7 +61,7 @@ class Slow:
         hidden = np.maximum(np.maximum(inputs @ k3 + b3, 0) @ k4 + b4, 0)
         return sigma, 1 / (1 + np.exp(-(hidden @ k5 + b5)))
 
-    def render(self, rays: Rays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def render(self, rays: Rays) -> tuple[np.ndarray, ...]:
         """Opacity [n], colour [n, 3] and opacity-weighted distance [n]."""
         scale = 1.0 if self.pose is None else np.exp(self.pose[3])
         rows = []
