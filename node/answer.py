@@ -1,0 +1,41 @@
+"""A region's answer in words and as JSON."""
+
+import json
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from perception.hypotheses import FrameName, load_scene
+from perception.query import Box, Points, QueryResult, query
+
+CM3 = 1e6  # per cubic metre
+
+
+def answer(path: Path, region: Box | Points, frame: FrameName, as_json: bool, out: Console) -> None:
+    """Ask the objects of a hypotheses file or folder about a region and print the answer.
+
+    Raises FileNotFoundError or ValueError in one line.
+    """
+    result = query(load_scene(path), region, frame)
+    if as_json:
+        out.print(json.dumps(result.as_dict(), indent=1), highlight=False, soft_wrap=True, markup=False)
+        return
+    table = Table.grid(padding=(0, 2))
+    for name, value in _rows(result):
+        table.add_row(name, value)
+    out.print(table, highlight=False)
+    for i, p in enumerate(result.p_occupied or [], start=1):
+        out.print(f"  point {i}: occupied with probability {p:.3f}", highlight=False)
+
+
+def _rows(r: QueryResult) -> list[tuple[str, str]]:
+    v = {name: CM3 * value for name, value in r.volume_m3.items()}
+    return [
+        ("all of it is free", f"{r.p_free:.3f} ± {r.p_free_se:.3f}"),
+        ("occupied volume", f"{v['q50']:.1f} cm³ (5 to 95%: {v['q05']:.1f} to {v['q95']:.1f})"),
+        ("unseen", f"{100 * r.unseen_fraction:.0f}%"),
+        ("outside every object's cube", f"{100 * r.outside_fraction:.0f}% (counted as free: it was not looked at)"),
+        ("mean entropy", f"{r.entropy_nats:.3f} nats per voxel"),
+        ("effective hypotheses", f"{r.effective_hypotheses:.1f}"),
+    ]

@@ -1,0 +1,53 @@
+"""What is said of an object in a few numbers: the same in `replay`'s table, in `view` and under the picture."""
+
+import numpy as np
+from jaxtyping import Float
+
+from perception.hypotheses import Hypotheses
+from probnerf.occupancy import voxel_centres
+from probnerf.types import BASE_Z
+
+CM3 = 1e6  # per cubic metre
+
+
+def hidden_volume(h: Hypotheses) -> tuple[float, Float[np.ndarray, "3"]]:
+    """Space in the cube above the plane that the camera did not see (m^3), and how much of it is solid (m^3): the 5, 50
+    and 95% weighted quantiles over hypotheses.
+    """
+    hidden = ~h.seen & (voxel_centres(h.grid)[..., 2] > BASE_Z)
+    solid = h.solid[:, hidden].sum(axis=1) * h.voxel_m**3
+    order = np.argsort(solid)
+    at = np.searchsorted(np.cumsum(h.weights[order]), [0.05, 0.5, 0.95])
+    return float(hidden.sum() * h.voxel_m**3), solid[order][np.minimum(at, len(order) - 1)]
+
+
+def figures(h: Hypotheses) -> dict[str, str]:
+    """Short names and values with units, in the order of reading."""
+    space, (low, middle, high) = hidden_volume(h)
+    d = h.diagnostics
+    evidence, error = d.get("log_evidence", np.nan), d.get("log_evidence_se", np.nan)
+    return {
+        "hypotheses": f"{len(h.weights)} ({h.effective_hypotheses:.1f} effective)",
+        "ESS": _number(d.get("ess", np.nan), ".0f"),
+        "log evidence": f"{evidence:.1f} ± {_number(error, '.1f')} nats" if np.isfinite(evidence) else "none",
+        "unseen space": f"{CM3 * space:.0f} cm³",
+        "solid in it": f"{CM3 * middle:.0f} cm³ ({CM3 * low:.0f} to {CM3 * high:.0f})",
+        "acceptance": _number(d.get("acceptance", np.nan), ".2f"),
+        "stopped": f"{h.result}, stage {h.stage}",
+    }
+
+
+def warnings(h: Hypotheses) -> list[str]:
+    """What makes the answer doubtful, if anything."""
+    out = []
+    if h.out_of_model:
+        out.append("out of model: no shape of the prior explains this view; its answers are cautious")
+    if not h.inside_view:
+        out.append("the picture's border cuts the object off")
+    if h.diagnostics.get("divergences", 0.0) > 0:
+        out.append(f"{h.diagnostics['divergences']:.0f} divergent trajectories")
+    return out
+
+
+def _number(value: float, form: str) -> str:
+    return f"{value:{form}}" if np.isfinite(value) else "none"

@@ -1,0 +1,95 @@
+"""Training a prior: the views, the run (resumed where it was stopped), its curves, and the weights in the end."""
+
+import json
+import subprocess
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from node.plot import draw_training
+from probnerf import foam
+from probnerf import train as training
+from probnerf.families.tabletop import TRAIN_SEEDS
+from probnerf.model import Likelihood
+from probnerf.prior import PRESETS, ProbNeRF
+from probnerf.store import save_prior
+from probnerf.views import draw_views
+
+
+@dataclass(frozen=True)
+class Training:
+    """What is trained, on what, and where it is kept."""
+
+    out: Path = Path("runs/tabletop")
+    """Folder of the run: checkpoint, history, curves.png and, in the end, prior.safetensors."""
+    preset: Literal["small", "paper", "tiny"] = "small"
+    """Sizes of the model: small for two CPU cores, the paper's, or tiny for a trial."""
+    objects: int = 20_000
+    """Training objects: the first seeds of the family."""
+    pictures: int = 8
+    """Pictures of each object."""
+    recipe: training.TrainConfig = field(default_factory=training.TrainConfig)
+
+
+def train(options: Training, out: Console, err: Console) -> bool:
+    """Train, or go on where an earlier run of the same recipe in `options.out` was stopped. False after Ctrl-C.
+
+    Raises ValueError where the folder holds another recipe, FloatingPointError where the loss is no number.
+    """
+    preset, config, folder = PRESETS[options.preset], options.recipe, options.out
+    if not 1 <= options.objects <= len(TRAIN_SEEDS):
+        raise ValueError(f"--objects is {options.objects}; give 1 to {len(TRAIN_SEEDS)}")
+    history, curves, weights = folder / "history.jsonl", folder / "curves.png", folder / "prior.safetensors"
+    likelihood = Likelihood(lattice=foam.Lattice(preset.lattice, 1.0, 9 * preset.lattice // 4))
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    state = None
+    try:
+        with Progress(*columns, TimeRemainingColumn(), console=err) as progress:
+            drawing = progress.add_task("pictures", total=options.objects)
+            seeds = np.asarray(TRAIN_SEEDS[: options.objects])
+            views = draw_views(
+                seeds,
+                options.pictures,
+                preset.image_size,
+                progress=lambda done, total: progress.update(drawing, completed=done),
+            )
+            steps = progress.add_task("steps", total=config.steps)
+            model = ProbNeRF(preset, np.array([0, config.seed], np.uint32))  # type: ignore[arg-type]  # a raw key
+            for state, metrics in training.train(model, views, likelihood, config, folder):  # noqa: B007
+                text = "steps  " + "  ".join(f"{k} {v:.4g}" for k, v in metrics.items() if k != "step")
+                progress.update(steps, completed=int(metrics["step"]), description=text)
+    except KeyboardInterrupt:
+        out.print("stopped; the same command goes on from the last checkpoint", highlight=False)
+        return False
+    finally:
+        if history.is_file() and (lines := history.read_text(encoding="utf-8").splitlines()):
+            draw_training(curves, [json.loads(line) for line in lines])
+            out.print(str(curves), highlight=False, soft_wrap=True)
+    if state is None:
+        out.print(f"{folder} is trained already", highlight=False, soft_wrap=True)
+        return True
+    story = {
+        "family": "tabletop",
+        "seeds": [TRAIN_SEEDS.start, TRAIN_SEEDS.start + options.objects],
+        "pictures": options.pictures,
+        "recipe": asdict(config),
+        "steps": int(state.step),
+        "revision": _revision(),
+        "gate": None,
+    }
+    save_prior(weights, state.average, story)
+    out.print(f"{weights}; judge it with `farside bench prior --prior {weights}`", highlight=False, soft_wrap=True)
+    return True
+
+
+def _revision() -> str:
+    """The checkout's git revision, with + where files were changed; empty outside a checkout."""
+    command = ("git", "-C", str(Path(__file__).parent), "describe", "--always", "--abbrev=12", "--dirty=+")
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""
