@@ -149,8 +149,10 @@ def crop(frame: Frame, segment: Segment, cube: ObjectFrame, size: int) -> Pictur
     is_object = status == OBJECT
     return Picture(
         rgb=jnp.asarray((frame.rgb[v, u] / 255.0).reshape(size, size, 3), jnp.float32),
-        distance=jnp.asarray(np.where(is_object, range_cube, 0.0).reshape(size, size), jnp.float32),
-        unknown=jnp.asarray(((status == UNKNOWN) | (is_object & ~np.isfinite(z))).reshape(size, size), jnp.float32),
+        distance=jnp.asarray(
+            np.where(is_object, np.where(np.isfinite(z), range_cube, -1.0), 0.0).reshape(size, size), jnp.float32
+        ),
+        unknown=jnp.asarray((status == UNKNOWN).reshape(size, size), jnp.float32),
         T_view_camera=jnp.asarray(T_view_camera, jnp.float32),
         tan_half_fov=jnp.asarray(tan_half, jnp.float32),
     )

@@ -10,6 +10,7 @@ from typing import Protocol
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from probnerf.types import BASE_Z
@@ -91,6 +92,10 @@ def encoded_size(octaves: int) -> int:
     return 3 * (1 + 2 * octaves)
 
 
+def _octave_scale(octaves: int) -> np.ndarray:
+    return np.concatenate([np.ones(3), np.repeat(2.0 ** (-0.75 * np.arange(octaves)), 6)])
+
+
 class MLPField(eqx.Module):
     """Two MLPs with two hidden layers each: density, then colour from position, direction and density (paper §2.3).
 
@@ -113,6 +118,22 @@ class MLPField(eqx.Module):
     def size(self) -> int:
         """Weights per object (20,868 in the paper's preset)."""
         return sum(math.prod(shape) for shape in self.shapes)
+
+    @property
+    def weight_scale(self) -> np.ndarray:
+        """f32[size], the natural size of each weight: He's sqrt(2 / fan in), octave j of an encoding times 2^(-0.75 j).
+
+        A hypernetwork that works in these units starts at a smooth field and learns coarse shape before detail.
+        """
+        scale, fan_in = [], 1
+        for shape in self.shapes:
+            fan_in = shape[0] if len(shape) == 2 else fan_in
+            scale.append(np.full(shape, math.sqrt(2.0 / fan_in)))
+        for index, encodings in ((0, [self.octaves]), (6, [self.octaves, self.direction_octaves])):
+            rows = [_octave_scale(octaves) for octaves in encodings]
+            rows.append(np.ones(scale[index].shape[0] - sum(map(len, rows))))
+            scale[index] *= np.concatenate(rows)[:, None]
+        return np.concatenate([part.ravel() for part in scale]).astype(np.float32)
 
     def unpack(self, weights: Float[Array, "d"]) -> list[Array]:
         """The flat vector as twelve arrays."""

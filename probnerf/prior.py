@@ -5,6 +5,7 @@ Paper §2.1 to §2.3. Presets change only numbers.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from probnerf.field import MLPField
+from probnerf.field import MLPField, encoded_size
 
 CAMERA_FEATURES = 13  # rotation (9), position (3), tangent of the half field of view
-IMAGE_CHANNELS = 6  # rgb, object mask, unknown mask, relative range
+POINT_OCTAVES = 2  # of the encoding of each pixel's place in the object frame
+IMAGE_CHANNELS = 6 + encoded_size(POINT_OCTAVES)  # rgb; object, unknown and range masks; the place
 
 
 @dataclass(frozen=True)
@@ -43,10 +45,17 @@ PRESETS = {
     preset.name: preset
     for preset in (
         Preset("paper", 128, 64, 10, 10, 512, 512, 128, 128, (32, 64, 128, 128, 128)),
-        Preset("small", 48, 48, 6, 1, 128, 256, 32, 32, (16, 32, 48, 64, 64)),
+        Preset("small", 48, 48, 6, 1, 128, 256, 32, 32, (24, 32, 48, 64, 128)),
         Preset("tiny", 4, 8, 2, 1, 16, 16, 8, 16, (4, 4, 4, 4, 4)),  # for tests
     )
 }
+
+
+def relu_layer(layer: eqx.nn.Linear | eqx.nn.Conv2d) -> Any:
+    """The layer with He's scale (weights of variance 2 / fan in): signals keep their size through ReLU layers."""
+    assert layer.bias is not None
+    scaled = layer.weight * math.sqrt(6.0)  # equinox draws uniformly with variance 1 / (3 fan in)
+    return eqx.tree_at(lambda n: (n.weight, n.bias), layer, (scaled, jnp.zeros_like(layer.bias)))
 
 
 class TwoLayer(eqx.Module):
@@ -57,7 +66,8 @@ class TwoLayer(eqx.Module):
 
     def __init__(self, inputs: int, outputs: int, hidden: int, key: PRNGKeyArray):
         k0, k1 = jax.random.split(key)
-        self.first, self.last = eqx.nn.Linear(inputs, hidden, key=k0), eqx.nn.Linear(hidden, outputs, key=k1)
+        self.first = relu_layer(eqx.nn.Linear(inputs, hidden, key=k0))
+        self.last = eqx.nn.Linear(hidden, outputs, key=k1)
 
     def __call__(self, x: Float[Array, "i"]) -> Float[Array, "o"]:
         return self.last(jax.nn.relu(self.first(x)))
@@ -147,26 +157,22 @@ class HyperNetwork(eqx.Module):
     hidden1: eqx.nn.Linear
     weight: Float[Array, "d h"]
     bias: Float[Array, "d"]
-    scale: Float[Array, "d"]  # each weight's size at initialisation (1 / sqrt(fan in)): outputs start as a fresh MLP's
+    scale: Float[Array, "d"]  # each weight's natural size (`MLPField.weight_scale`): outputs start as a fresh MLP's
 
     def __init__(self, latent: int, hidden: int, field: MLPField, key: PRNGKeyArray):
         k0, k1, k2, k3 = jax.random.split(key, 4)
-        self.hidden0 = eqx.nn.Linear(latent, hidden, key=k0)
-        self.hidden1 = eqx.nn.Linear(hidden, hidden, key=k1)
-        scale, start, fan_in = [], [], 1
-        for shape, k in zip(field.shapes, jax.random.split(k3, len(field.shapes)), strict=True):
-            kernel = len(shape) == 2
-            fan_in = shape[0] if kernel else fan_in
-            scale.append(jnp.full((math.prod(shape),), math.sqrt(2.0 / fan_in)))
-            start.append(scale[-1] * jax.random.normal(k, scale[-1].shape) * (1.0 if kernel else 0.0))
-        self.scale = jnp.concatenate(scale)
-        self.bias = jnp.concatenate(start) / self.scale
-        self.weight = 0.5 * jax.random.normal(k2, (field.size, hidden)) / math.sqrt(hidden)
+        self.hidden0 = relu_layer(eqx.nn.Linear(latent, hidden, key=k0))
+        self.hidden1 = relu_layer(eqx.nn.Linear(hidden, hidden, key=k1))
+        self.scale = jnp.asarray(field.weight_scale)
+        kernels = np.concatenate([np.full(math.prod(shape), len(shape) == 2) for shape in field.shapes])
+        self.bias = jax.random.normal(k3, (field.size,)) * kernels
+        self.weight = 0.5 * jax.random.normal(k2, (field.size, hidden))
 
     def __call__(self, z: Float[Array, "k"]) -> Float[Array, "d"]:
         h = jax.nn.relu(self.hidden0(z))
         h = jax.nn.relu(self.hidden1(h))
-        return jax.lax.stop_gradient(self.scale) * (self.weight @ h + self.bias)
+        # dividing here, not in the weights, keeps Adam's steps in w as small as the bias's
+        return jax.lax.stop_gradient(self.scale) * (self.weight @ h / math.sqrt(h.shape[0]) + self.bias)
 
 
 class Encoder(eqx.Module):
@@ -183,15 +189,12 @@ class Encoder(eqx.Module):
         keys = jax.random.split(key, len(preset.encoder_channels) + 3)
         channels = (IMAGE_CHANNELS, *preset.encoder_channels)
         self.convolutions = tuple(
-            eqx.nn.Conv2d(a, b, 3, stride=2, padding=1, key=k)
-            for a, b, k in zip(channels[:-1], channels[1:], keys, strict=False)
+            relu_layer(eqx.nn.Conv2d(a, b, 3, stride=2 if i < 3 else 1, padding=1, key=k))
+            for i, (a, b, k) in enumerate(zip(channels[:-1], channels[1:], keys, strict=False))
         )
-        side = preset.image_size
-        for _ in preset.encoder_channels:
-            side = (side + 1) // 2
-        width = 4 * preset.encoder_channels[-1]
+        width = 2 * channels[-1]
         self.camera = TwoLayer(CAMERA_FEATURES, width // 2, width // 2, keys[-3])
-        self.hidden = eqx.nn.Linear(side * side * channels[-1] + width // 2, width, key=keys[-2])
+        self.hidden = relu_layer(eqx.nn.Linear(2 * channels[-1] + width // 2, width, key=keys[-2]))
         self.output = eqx.nn.Linear(width, 2 * preset.latent, key=keys[-1])
         self.prior_mean = jnp.zeros(preset.latent)
         self.prior_log_precision = jnp.zeros(preset.latent)
@@ -201,9 +204,12 @@ class Encoder(eqx.Module):
         h = image
         for convolution in self.convolutions:
             h = jax.nn.relu(convolution(h))
-        h = jax.nn.relu(self.hidden(jnp.concatenate([h.reshape(-1), jax.nn.relu(self.camera(camera))])))
+        # pooled: a feature knows its place in the object frame, not in the picture
+        parts = [jnp.mean(h, axis=(1, 2)), jnp.max(h, axis=(1, 2)), jax.nn.relu(self.camera(camera))]
+        h = jax.nn.relu(self.hidden(jnp.concatenate(parts)))
         mean, log_precision = jnp.split(self.output(h), 2)
-        return mean, jnp.exp(6.0 * jnp.tanh(log_precision / 6.0))
+        # starts at precision 20: at unit noise the decoder would learn to ignore z
+        return mean, jnp.exp(3.0 + 6.0 * jnp.tanh(log_precision / 6.0))
 
     def __call__(
         self, images: Float[Array, "j c s s"], cameras: Float[Array, "j 13"], used: Float[Array, "j"]

@@ -19,7 +19,7 @@ class Picture(eqx.Module):
     """What the encoder sees: a square view of the cube by a camera that looks at its centre (view frame)."""
 
     rgb: Float[Array, "s s 3"]  # in [0, 1]
-    distance: Float[Array, "s s"]  # along the ray; 0 where the pixel is not the object
+    distance: Float[Array, "s s"]  # along the ray; 0: not the object, -1: the object, at an unknown range
     unknown: Float[Array, "s s"]  # 1 where the pixel says nothing
     T_view_camera: Float[Array, "4 4"]
     tan_half_fov: Float[Array, ""]
@@ -31,9 +31,8 @@ def potential_at(model: ProbNeRF, picture: Picture, pose: Pose, flatten: float) 
     position = pose.to_object(T[:3, 3])
     rotation = pose.to_object_direction(T[:3, :3].T).T
     T_object_camera = jnp.eye(4).at[:3, :3].set(rotation).at[:3, 3].set(position)
-    image = encoder_image(
-        picture.rgb, picture.distance * jnp.exp(-pose.log_scale), picture.unknown, jnp.linalg.norm(position)
-    )
+    distance = picture.distance * jnp.exp(-pose.log_scale)
+    image = encoder_image(picture.rgb, distance, picture.unknown, T_object_camera, picture.tan_half_fov)
     mean, precision = model.encoder(
         image[None], camera_features(T_object_camera, picture.tan_half_fov)[None], jnp.ones(1)
     )

@@ -60,9 +60,7 @@ def encode(model: ProbNeRF, batch: Batch) -> tuple[Float[Array, "b k"], Float[Ar
     """Mean and precision of q(z | views) per object."""
 
     def one(rgb, distance, unknown, used, T, tangent):
-        images = jax.vmap(encoder_image)(
-            rgb / 255.0, distance, unknown.astype(jnp.float32), jnp.linalg.norm(T[:, :3, 3], axis=-1)
-        )
+        images = jax.vmap(encoder_image)(rgb / 255.0, distance, unknown.astype(jnp.float32), T, tangent)
         return model.encoder(images, jax.vmap(camera_features)(T, tangent), used)
 
     return jax.vmap(one)(

@@ -12,6 +12,8 @@ from jaxtyping import Array, Float
 
 from probnerf.families.render import look_at, pinhole_rays, trace_batch
 from probnerf.families.tabletop import sample_objects
+from probnerf.field import encode
+from probnerf.prior import POINT_OCTAVES
 from probnerf.types import Rays
 
 ENCODER_RADIUS = 1.25  # the encoder's picture shows this much around the cube's centre, in cube units
@@ -92,9 +94,28 @@ def encoder_image(
     rgb: Float[Array, "s s 3"],
     distance: Float[Array, "s s"],
     unknown: Float[Array, "s s"],
-    camera_distance: Float[Array, ""],
-) -> Float[Array, "6 s s"]:
-    """Channels first: masked colour, object mask, unknown mask, range less the camera's distance from the cube."""
-    mask = ((distance > 0.0) & (unknown < 0.5)).astype(jnp.float32)
-    relative = jnp.clip(distance - camera_distance, -1.5, 1.5) * mask
-    return jnp.concatenate([(jnp.moveaxis(rgb, -1, 0) - 0.5) * mask, mask[None], unknown[None], relative[None]])
+    T_object_camera: Float[Array, "4 4"],
+    tan_half_fov: Float[Array, ""],
+) -> Float[Array, "c s s"]:
+    """Channels first: masked colour, object mask, unknown mask, and where each pixel lies in the object frame, encoded.
+
+    Range becomes a point in canonical coordinates, so that the network need not learn to turn views: pooled features say
+    what is where, whatever the camera. Without range (distance < 0 marks an object pixel without one) they are 0.
+    """
+    size = rgb.shape[0]
+    known = unknown < 0.5
+    mask = (distance != 0.0) & known
+    pixel = ((jnp.arange(size) + 0.5) / (0.5 * size) - 1.0) * tan_half_fov
+    v, u = jnp.meshgrid(pixel, pixel, indexing="ij")
+    rays = jnp.stack([u, v, jnp.ones_like(u)], axis=-1)
+    rays = rays / jnp.linalg.norm(rays, axis=-1, keepdims=True) @ T_object_camera[:3, :3].T
+    points = T_object_camera[:3, 3] + distance[..., None] * rays
+    has_point = mask & (distance > 0.0)
+    encoded = encode(jnp.where(has_point[..., None], points, 0.0).reshape(-1, 3).T, POINT_OCTAVES).reshape(-1, size, size)
+    return jnp.concatenate(
+        [
+            (jnp.moveaxis(rgb, -1, 0) - 0.5) * mask,
+            jnp.stack([mask, ~known, has_point]).astype(jnp.float32),
+            encoded * has_point,
+        ]
+    )
