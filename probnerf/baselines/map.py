@@ -5,7 +5,7 @@ reconstructs an object of known pose when a prior is judged.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -23,11 +23,13 @@ Objective = Callable[[Any, Any, Array], Array]
 
 @dataclass(frozen=True)
 class MAPConfig:
-    """Adam with a cosine schedule; steps are in units of the latents' prior standard deviation."""
+    """Adam with a cosine schedule; rates are in units of the latents' prior standard deviation."""
 
     steps: int = 300
     learning_rate: float = 0.05
     final_learning_rate: float = 0.002
+    screen_steps: int = 50  # of `map_estimate`: every start climbs so far,
+    survivors: int = 4  # and the best so many go on for `steps`
 
 
 @partial(jax.jit, static_argnames=("objective", "config"))
@@ -79,10 +81,15 @@ def map_estimate(
     observation: Observation,
     starts: Float[Array, "p d"],
     config: MAPConfig,
-) -> tuple[Float[Array, "d"], Float[Array, "p"]]:
-    """The best position that Adam reaches from the starts, and the log posterior that each start reaches."""
+) -> tuple[Float[Array, "d"], Float[Array, "survivors"]]:
+    """The best position that Adam reaches from the starts, and the log posterior of each survivor, best first."""
     args = (model, likelihood, observation, faces_of_view(observation, likelihood.lattice))
-    q, _ = ascend(log_posterior, args, starts, config)
-    values = log_posterior(args, None, q)
-    values = jnp.where(jnp.isfinite(values), values, -jnp.inf)
-    return q[jnp.argmax(values)], values
+
+    def climb(q: Float[Array, "p d"], steps: int) -> tuple[Array, Array]:
+        q, _ = ascend(log_posterior, args, q, replace(config, steps=steps))
+        values = log_posterior(args, None, q)
+        order = jnp.argsort(-jnp.where(jnp.isfinite(values), values, -jnp.inf))[: config.survivors]
+        return q[order], values[order]
+
+    q, values = climb(climb(starts, config.screen_steps)[0], config.steps)
+    return q[0], values

@@ -84,11 +84,12 @@ def test_a_visible_handle_s_yaw_and_the_body_s_size_are_found_again():
     angles = np.arange(6) * np.pi / 3 + 0.4
     starts = np.zeros((6, 7), np.float32)
     starts[:, 2], starts[:, 3] = np.cos(angles), np.sin(angles)
-    best, values = map_estimate(MODEL, LIKELIHOOD, observation, jnp.asarray(starts), MAPConfig(steps=150))
-    assert np.isfinite(values).all() and values.max() > values.min() + 10.0  # wrong yaws end lower
+    best, values = map_estimate(MODEL, LIKELIHOOD, observation, jnp.asarray(starts), MAPConfig(steps=120))
+    assert np.isfinite(values).all() and values.shape == (4,)
+    assert values[0] > values[-1] + 10.0  # best first; wrong yaws end lower
     args = (MODEL, LIKELIHOOD, observation, faces_of_view(observation, LIKELIHOOD.lattice))
     at_truth = float(jax.jit(log_posterior)(args, None, jnp.asarray(truth)[None])[0])
-    assert float(values.max()) > at_truth - 1.0
+    assert float(values[0]) > at_truth - 1.0
     pose = pose_of(best[2:], observation.pose_sigma)
     assert abs(np.angle(np.exp(1j * (float(pose.yaw) - yaw)))) < np.deg2rad(6)
     size = MODEL.decode(best[:2])[1] * jnp.exp(pose.log_scale)  # only radius times scale is seen this well

@@ -1,0 +1,217 @@
+"""Hidden handles: vessels on a simulated table whose handle no pixel shows, with the truth in the view frame."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from calibration.camera import Camera
+from perception.observe import ObjectFrame, ObserveConfig, object_frame, seen_voxels
+from perception.segment import Segment, segment
+from perception.simulate import Picture, Placed, Scene, place_camera, render, sense, truth
+from perception.source import Frame
+from probnerf.families.render import pinhole_rays, trace
+from probnerf.families.tabletop import (
+    TRAIN_SEEDS,
+    TabletopObject,
+    canonical_parts,
+    part_distances,
+    sample_objects,
+    to_canonical,
+)
+from probnerf.occupancy import coarsen, solid
+from probnerf.types import Pose
+
+GRID = 32  # voxels per axis that answers are judged on
+FINE = 64  # voxels per axis of the truth, before it is coarsened as the hypotheses are
+
+
+@dataclass(frozen=True)
+class ViewConfig:
+    """The simulated camera and where it may stand."""
+
+    width: int = 640  # px
+    height: int = 480  # px
+    focal: float = 600.0  # px
+    elevation: tuple[float, float] = (15.0, 60.0)  # degrees above the table
+    distance: tuple[float, float] = (0.45, 0.9)  # m from the object's middle,
+    nearest: float = 3.5  # and at least so many half extents of the object
+    aim: float = 0.02  # m; standard deviation of where the camera looks about the object's middle
+    tries: int = 60  # placements drawn for a vessel before the next one is taken
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenVessel:
+    """One view in which the handle is hidden, and what is there. Grids are [i_x, i_y, i_z] over the view's cube."""
+
+    seed: int
+    frame: Frame  # with the sensor's faults, and the true mask as label 1
+    segment: Segment
+    cube: ObjectFrame
+    solid: Bool[np.ndarray, "32 32 32"]
+    seen: Bool[np.ndarray, "32 32 32"]  # by the true geometry
+    near_handle: Bool[
+        np.ndarray, "32 32 32"
+    ]  # outside the body, where the true handle passes as it turns about the axis
+
+
+def hidden_vessel(seed: int, config: ViewConfig | None = None) -> HiddenVessel | None:
+    """The vessel of a family seed in a view that does not show its handle, or None.
+
+    None: no handle, none hidden in `tries` draws of yaw and camera, or outside perception's range of sizes. The view is
+    the first of independent draws (uniform yaw, elevation and distance) in which no pixel shows the handle.
+    """
+    config = config or ViewConfig()
+    shape = Placed(seed, 0.0, 0.0, 0.0).shape
+    if not bool(shape.has_handle):
+        return None
+    rng = np.random.default_rng([seed, 23])
+    camera = Camera(
+        config.width,
+        config.height,
+        np.array([[config.focal, 0, config.width / 2], [0, config.focal, config.height / 2], [0, 0, 1]]),
+        np.zeros(5),
+    )
+    for _ in range(config.tries):
+        placed, T_world_camera = _place(seed, rng, config)
+        T_object_camera = np.linalg.inv(placed.T_world_object) @ T_world_camera
+        T_object_camera[:3, 3] /= placed.half_extent
+        if _shows_handle(shape, T_object_camera):
+            continue
+        scene = Scene((placed,))
+        picture = render(scene, camera, T_world_camera)
+        T_camera_object = truth(scene, T_world_camera)[0]
+        if (picture.label == 1).sum() < 500 or _pixels_of_handle(picture, camera, T_camera_object, placed):
+            continue
+        frame = sense(picture, camera, T_world_camera, seed)
+        try:
+            found = segment(frame, 1)[0]
+            cube = object_frame(frame, found, ObserveConfig())
+        except ValueError:
+            return None
+        faultless = Frame(0, frame.frame_id, frame.rgb, picture.depth.astype(np.float32), None, camera)
+        T_canonical_view = _affine(cube, T_camera_object, placed.half_extent)
+        body, handle = (np.asarray(a) for a in _parts(shape, T_canonical_view, FINE))
+        swept = np.asarray(_swept(shape, T_canonical_view, GRID))
+        return HiddenVessel(
+            seed=seed,
+            frame=frame,
+            segment=found,
+            cube=cube,
+            solid=coarsen(solid((body | handle).astype(np.float32)), GRID),
+            seen=seen_voxels(faultless, cube, GRID),
+            near_handle=swept & ~coarsen(body, GRID),
+        )
+    return None
+
+
+def _place(seed: int, rng: np.random.Generator, config: ViewConfig) -> tuple[Placed, Float[np.ndarray, "4 4"]]:
+    """A random placement and T_world_camera."""
+    placed = Placed(seed, rng.uniform(-0.05, 0.05), rng.uniform(-0.05, 0.05), rng.uniform(-np.pi, np.pi))
+    middle = placed.T_world_object[:3, 3]
+    azimuth, elevation = rng.uniform(-0.3, 0.3), np.deg2rad(rng.uniform(*config.elevation))  # it faces the wall
+    distance = max(rng.uniform(*config.distance), config.nearest * placed.half_extent)
+    towards = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+    position, target = middle + distance * towards, middle + rng.normal(0.0, config.aim, 3)
+    return placed, place_camera(tuple(position), tuple(target))
+
+
+def _shows_handle(obj: TabletopObject, T_object_camera: Float[np.ndarray, "4 4"], size: int = 96) -> bool:
+    """Whether a picture of the whole object, in canonical cube units, shows its handle."""
+    distance = float(np.linalg.norm(T_object_camera[:3, 3]))
+    origin, direction = pinhole_rays(T_object_camera, 0.5 * size * distance / 1.5, size)
+    hit, length, _ = (np.asarray(a) for a in trace(obj, origin, direction))
+    return bool(np.any(_on_handle(obj, origin + np.where(hit, length, 0.0)[:, None] * direction)[hit]))
+
+
+def _pixels_of_handle(
+    picture: Picture, camera: Camera, T_camera_object: Float[np.ndarray, "4 4"], placed: Placed
+) -> int:
+    """How many pixels of the faultless picture show the handle."""
+    v, u = np.nonzero(picture.label == 1)
+    rays = camera.rays(np.column_stack([u, v]))
+    points = rays / rays[:, 2:] * picture.depth[v, u][:, None]
+    points = (points - T_camera_object[:3, 3]) @ T_camera_object[:3, :3] / placed.half_extent
+    return int(_on_handle(placed.shape, points.astype(np.float32)).sum())
+
+
+def _on_handle(obj: TabletopObject, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    """Which surface points belong to the handle: it is the nearer part, by more than rounding."""
+    body, handle = (np.asarray(a) for a in part_distances(obj, jnp.asarray(points)))
+    return (handle < body) & (body > 0.004)
+
+
+def _affine(
+    cube: ObjectFrame, T_camera_object: Float[np.ndarray, "4 4"], half_extent: float
+) -> Float[np.ndarray, "4 4"]:
+    """p_canonical (cube units) = A @ p_view (cube units)."""
+    T = np.linalg.inv(T_camera_object) @ cube.T_camera_object  # metres
+    A = np.eye(4)
+    A[:3, :3] = T[:3, :3] * cube.half_extent / half_extent
+    A[:3, 3] = T[:3, 3] / half_extent
+    return A
+
+
+def _half_lattice(A: Float[Array, "4 4"], grid: int) -> Float[Array, "m m m 3"]:
+    """Corners, edge, face and centre points of all voxels of the view's cube, in canonical cube units."""
+    axis = jnp.linspace(-1.0, 1.0, 2 * grid + 1)
+    points = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    return points @ A[:3, :3].T + A[:3, 3]
+
+
+def _any_in_voxel(inside: Bool[Array, "m m m"]) -> Bool[Array, "g g g"]:
+    return jax.lax.reduce_window(inside, False, jax.lax.bitwise_or, (3, 3, 3), (2, 2, 2), "valid")
+
+
+@partial(jax.jit, static_argnames="grid")
+def _parts(obj: TabletopObject, A: Float[Array, "4 4"], grid: int) -> tuple[Array, Array]:
+    """Voxels that meet the body, and the handle."""
+    body, handle = part_distances(obj, _half_lattice(A, grid))
+    return _any_in_voxel(body <= 0.0), _any_in_voxel(handle <= 0.0)
+
+
+@partial(jax.jit, static_argnames="grid")
+def _swept(obj: TabletopObject, A: Float[Array, "4 4"], grid: int) -> Bool[Array, "g g g"]:
+    """Voxels that the handle meets at some yaw. It lies about azimuth 0, so half a radian of turns covers it."""
+    x, y, z = to_canonical(obj, _half_lattice(A, grid))
+    r = jnp.sqrt(x * x + y * y)
+
+    def at(angle: Array) -> Array:
+        return canonical_parts(obj, r * jnp.cos(angle), r * jnp.sin(angle), z)[1]
+
+    return _any_in_voxel(jnp.min(jax.lax.map(at, jnp.linspace(0.0, 0.5, 11)), axis=0) <= 0.0)
+
+
+@partial(jax.jit, static_argnames="grid")
+def _frequency(objects: TabletopObject, poses: Pose, grid: int) -> Float[Array, "g g g"]:
+    """Share of objects, each at its pose, that occupy a voxel of the view's cube."""
+
+    def one(item: tuple[TabletopObject, Pose]) -> Array:
+        points = _half_lattice(jnp.eye(4), grid)
+        body, handle = part_distances(item[0], item[1].to_object(points))
+        return _any_in_voxel(jnp.minimum(body, handle) <= 0.0)
+
+    def add(total: Array, item: tuple[TabletopObject, Pose]) -> tuple[Array, None]:
+        return total + one(item), None
+
+    total, _ = jax.lax.scan(add, jnp.zeros((grid, grid, grid)), (objects, poses))
+    return total / poses.yaw.shape[0]
+
+
+def base_rate(objects: int = 1024, grid: int = GRID, config: ObserveConfig | None = None) -> Float[np.ndarray, "g g g"]:
+    """Training-set frequency of occupancy in the view frame: family objects at any yaw, placed by perception's widths.
+
+    The law has the cube's symmetries about the vertical (quarter turns and a mirror), so the estimate is averaged over
+    all eight.
+    """
+    config = config or ObserveConfig()
+    rng = np.random.default_rng(29)
+    yaw, spread = rng.uniform(-np.pi, np.pi, objects), rng.standard_normal((3, objects))
+    x, y, log_scale = spread * np.array([[config.xy_sigma], [config.xy_sigma], [config.log_scale_sigma]])
+    poses = Pose(*(jnp.asarray(a, jnp.float32) for a in (yaw, x, y, log_scale)))
+    rate = np.asarray(_frequency(sample_objects(TRAIN_SEEDS[:objects]), poses, grid), np.float64)
+    turned = [np.rot90(r, k) for r in (rate, rate[:, ::-1]) for k in range(4)]
+    return np.mean(turned, axis=0)

@@ -1,0 +1,141 @@
+"""What the measurements measure with: scenes, truths and scores are what they claim to be."""
+
+import numpy as np
+import pytest
+
+from benchmarks.frame import (
+    DATA,
+    OBJECTS,
+    TrueObject,
+    free_points,
+    is_hidden,
+    outward_normals,
+    read_truth,
+    weighted_median,
+)
+from benchmarks.hidden import judge, random_boxes
+from benchmarks.prior import VIEWS, see
+from benchmarks.rivals import METHODS, POSTERIOR, Answer
+from benchmarks.scene import base_rate, hidden_vessel
+from benchmarks.summary import mean_rows
+from perception.plane import heights
+from perception.segment import segment
+from perception.source import read_frame_folder
+from probnerf.occupancy import voxel_centres
+from probnerf.types import BASE_Z
+
+
+@pytest.fixture(scope="module")
+def rate():
+    return base_rate(24)
+
+
+@pytest.fixture(scope="module")
+def vessel():
+    found = hidden_vessel(2_000_001)
+    assert found is not None
+    return found
+
+
+def test_the_base_rate_has_the_table_s_symmetries(rate):
+    np.testing.assert_allclose(rate, np.rot90(rate), atol=1e-12)
+    np.testing.assert_allclose(rate, rate[::-1], atol=1e-12)
+    assert rate[..., voxel_centres(32)[0, 0, :, 2] < BASE_Z - 0.05].max() == 0.0
+    assert rate[15:17, 15:17, 4].min() > 0.9  # almost everything has a bottom in the middle
+    assert rate[0, 0].max() == 0.0
+
+
+def test_a_hidden_handle_is_there_and_unseen(vessel):
+    """Some of the solid lies in the handle's stratum, and all of that behind what the camera sees."""
+    handle = vessel.solid & vessel.near_handle
+    assert handle.sum() > 20
+    assert (handle & ~vessel.seen).sum() > 0.9 * handle.sum()
+    assert vessel.near_handle.sum() > 3 * handle.sum()  # a ring, of which the handle is a part
+
+
+def test_what_the_camera_saw_as_free_is_not_solid(vessel):
+    """Of the solid only the visible skin is seen, and every hit lies close to the true solid."""
+    assert (vessel.seen & vessel.solid).sum() < 0.5 * vessel.solid.sum()
+    v, u = np.nonzero(vessel.segment.status == 1)
+    rays = vessel.frame.camera.rays(np.column_stack([u, v]))
+    points = vessel.cube.to_cube(rays / rays[:, 2:] * vessel.frame.depth[v, u][:, None])
+    points = points[np.isfinite(points).all(axis=1)]
+    index = np.floor((points + 1.0) * 16).astype(int)
+    near = np.pad(vessel.solid, 1)
+    near = np.any([np.roll(near, s, a) for a in range(3) for s in (-1, 0, 1)], axis=0)[1:-1, 1:-1, 1:-1]
+    inside = ((index >= 0) & (index < 32)).all(axis=1)
+    assert near[tuple(index[inside].T)].mean() > 0.99
+
+
+def test_the_truth_scores_best_and_is_never_falsely_free(vessel, rate):
+    rng = np.random.default_rng(0)
+    even = np.full(4, 0.25)
+    guesses = rng.random((4, 32, 32, 32)) < rate
+    given = {m: Answer(guesses, even, 1.0) for m in METHODS}
+    given[POSTERIOR] = Answer(vessel.solid[None], np.ones(1), 1.0, "converged")
+    found = judge(vessel, given, rate, 0, warm=True)
+    best = found.values[POSTERIOR]
+    for method in METHODS[1:]:
+        assert best["hidden_nll"] < found.values[method]["hidden_nll"]
+        assert best["hidden_nll_handle"] < found.values[method]["hidden_nll_handle"]
+    assert best["hidden_nll"] < 0.02 and best["hidden_ece"] < 0.03
+    assert not (found.occupied & (found.p_free[POSTERIOR] > 0.95)).any()
+    assert not (found.scored & vessel.seen).any()
+
+
+def test_boxes_lie_about_scored_voxels():
+    scored = np.zeros((32, 32, 32), bool)
+    scored[3, 30, 16] = True
+    boxes = random_boxes(scored, 50, np.random.default_rng(1))
+    assert (boxes[:, 0] >= 0).all() and (boxes[:, 1] <= 32).all()
+    assert ((boxes[:, 0] <= [3, 30, 16]) & (boxes[:, 1] > [3, 30, 16])).all()
+
+
+def test_given_and_held_out_views_alternate_around_the_object():
+    seen = see(2_000_003, 16, 8)
+    position = seen.T_object_camera[:, :3, 3]
+    azimuth = np.rad2deg(np.arctan2(position[:, 1], position[:, 0]))
+    np.testing.assert_allclose(np.diff(np.sort(azimuth)), 45.0, atol=1e-6)
+    np.testing.assert_allclose((azimuth[VIEWS:] - azimuth[:VIEWS]) % 360, 45.0, atol=1e-6)
+    elevation = np.rad2deg(np.arcsin(position[:, 2] / np.linalg.norm(position, axis=1)))
+    assert elevation.min() >= 15.0 and elevation.max() <= 60.0
+    assert ((seen.range > 0).sum(axis=(1, 2)) > 10).all()
+
+
+def test_normals_of_a_sphere_point_outwards():
+    rng = np.random.default_rng(2)
+    points = rng.standard_normal((2000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    normals = outward_normals(0.05 * points + [0.1, 0.2, 0.7])
+    assert (np.einsum("ni,ni->n", normals, points) > 0.97).mean() > 0.99
+
+
+def test_a_weighted_median_splits_the_weight():
+    assert weighted_median(np.array([3.0, 1.0, 2.0]), np.array([0.2, 0.2, 0.6])) == 2.0
+    assert weighted_median(np.array([3.0, 1.0, 2.0]), np.array([0.7, 0.1, 0.2])) == 3.0
+
+
+def test_a_box_turns_with_its_object():
+    T = np.eye(4)
+    T[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    T[:3, 3] = [1.0, 0.0, 0.0]
+    model = TrueObject(np.array([[0.0, 0, 0], [0.3, 0.1, 0.1]]), T)
+    inside = model.box_holds(np.array([[0.95, 0.25, 0.05], [1.25, 0.05, 0.05]]), 0.01)
+    assert inside.tolist() == [True, False]
+
+
+def test_mean_rows_carry_their_interval():
+    mean, low, high = mean_rows("x", "m", "c", "score", [1.0, 2.0, np.nan, 3.0], "nats")
+    assert (mean.value, mean.n, low.metric, high.metric) == (2.0, 3, "score_q025", "score_q975")
+    assert low.value < 2.0 < high.value
+
+
+def test_free_points_of_the_real_frame_are_free_and_unseen(shared_data):
+    frame, truth = read_frame_folder(DATA), read_truth(DATA)
+    plane = segment(frame, 1)[0].plane
+    points = free_points(frame, plane, truth, 1)
+    assert len(points) > 500 and set(truth) == set(OBJECTS)
+    assert (heights(points, plane) > 0).all() and is_hidden(frame, points).all()
+    for other in truth.values():
+        assert not other.box_holds(points, 0.0).any()
+        assert np.linalg.norm(points[::50, None] - other.in_camera[None], axis=-1).min() >= 0.015
