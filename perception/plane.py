@@ -3,19 +3,24 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
 
 @dataclass(frozen=True)
 class PlaneConfig:
-    """Lengths in metres."""
+    """Lengths in metres; those marked * hold up to 1 m from the camera and grow with `noise_growth` beyond."""
 
-    tolerance: float = 0.008  # half thickness of the slab that counts as the plane
-    lowest: float = 0.016  # what stands on a plane has points at heights between these
-    highest: float = 0.5
+    tolerance: float = 0.008  # * half thickness of the slab that counts as the plane
+    lowest: float = 0.016  # * what stands on a plane has points higher than this
+    highest: float = 0.5  # and lower than this
     triplets: int = 1000  # planes tried
     seed: int = 0
+
+
+def noise_growth(points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "..."]:
+    """How much more than within 1 m a sensor's depth errs at points in the camera frame (m): with depth squared."""
+    return np.maximum(1.0, points[..., 2] ** 2)
 
 
 def heights(points: Float[np.ndarray, "... 3"], plane: Float[np.ndarray, "4"]) -> Float[np.ndarray, "..."]:
@@ -24,13 +29,14 @@ def heights(points: Float[np.ndarray, "... 3"], plane: Float[np.ndarray, "4"]) -
 
 
 def support_plane(
-    points: Float[np.ndarray, "h w 3"], config: PlaneConfig
+    points: Float[np.ndarray, "h w 3"], label: Int[np.ndarray, "h w"] | None, config: PlaneConfig
 ) -> tuple[Float[np.ndarray, "4"], Bool[np.ndarray, "h w"]]:
     """The plane (n, d) that things stand on and its pixels.
 
-    RANSAC over triplets of points up to a quarter of the picture apart, three planes one after the other, each refitted
+    RANSAC over triplets of points up to a quarter of the picture apart, four planes one after the other, each refitted
     to its inliers by total least squares. The most pixels win, where a plane that leans away from the picture's upward
-    direction (a wall) counts a quarter, and one with nothing standing on it (the floor, a box's top) a tenth.
+    direction (a wall) counts a quarter, and one with nothing standing on it (the floor, a box's top) a tenth. What may
+    stand on it is whatever the label map numbers, or without one any point that is a little higher.
     Raises `ValueError` where no plane holds a twentieth of the points.
     """
     rng = np.random.default_rng(config.seed)
@@ -38,9 +44,12 @@ def support_plane(
     pixels = np.argwhere(np.isfinite(points[..., 2]))
     pixels = pixels[rng.permutation(len(pixels))[:20_000]]
     cloud = points[pixels[:, 0], pixels[:, 1]]
+    growth = noise_growth(cloud)
+    slab = config.tolerance * growth
+    things = np.ones(len(cloud), bool) if label is None else label[pixels[:, 0], pixels[:, 1]] > 0
     free = np.ones(len(cloud), bool)  # not yet on a plane
     best, best_score = None, 0.0
-    for _ in range(3):
+    for _ in range(4):
         if free.sum() < max(3, 0.05 * len(cloud)):
             break
         seeds = pixels[rng.choice(np.flatnonzero(free), config.triplets)]
@@ -56,10 +65,10 @@ def support_plane(
             continue
         sparse = cloud[free][:2000]
         distance = np.abs(sparse @ normals.T - np.einsum("ij,ij->i", normals, origins))
-        at = int((distance < config.tolerance).sum(axis=0).argmax())
+        at = int((distance < slab[free][:2000, None]).sum(axis=0).argmax())
         plane = np.append(normals[at], -normals[at] @ origins[at])
         for _ in range(4):
-            on = free & (np.abs(heights(cloud, plane)) < config.tolerance)
+            on = free & (np.abs(heights(cloud, plane)) < slab)
             if on.sum() < 3:
                 break
             centre = cloud[on].mean(axis=0)
@@ -71,13 +80,16 @@ def support_plane(
         if share < 0.05:
             continue
         height = heights(cloud, plane)
-        standing = over(cloud, plane, cloud[on], -0.02) & (height > config.lowest) & (height < config.highest)
-        score = share * (1.0 if -plane[1] > 0.1 else 0.25) * (1.0 if standing.mean() > 0.005 else 0.1)
+        higher = (height > (0.0 if label is not None else config.lowest * growth)) & (height < config.highest)
+        standing = (higher & over(cloud, plane, cloud[on], -0.02))[things].sum() > things.sum() * (
+            0.001 if label is None else 0.5
+        )
+        score = share * (1.0 if -plane[1] > 0.1 else 0.25) * (1.0 if standing else 0.1)
         if score > best_score:
             best, best_score = plane, score
     if best is None:
         raise ValueError("no support plane was found; show more of the table, or check the depth and its unit")
-    return best, np.abs(heights(points, best)) < config.tolerance
+    return best, np.abs(heights(points, best)) < config.tolerance * noise_growth(points)
 
 
 def horizontal(plane: Float[np.ndarray, "4"]) -> Float[np.ndarray, "2 3"]:

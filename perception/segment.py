@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from perception.plane import PlaneConfig, heights, horizontal, over, support_plane
+from perception.plane import PlaneConfig, heights, horizontal, noise_growth, over, support_plane
 from perception.source import Frame
 from probnerf.types import FREE, OBJECT, UNKNOWN
 
@@ -21,8 +21,8 @@ class SegmentConfig:
     """Lengths in metres; heights are above the support plane."""
 
     plane: PlaneConfig = field(default_factory=PlaneConfig)
-    above: float = 0.008  # points higher than this stand on the plane
-    base: float = 0.003  # lower pixels next to an object belong to it down to here
+    above: float = 0.008  # points higher than this stand on the plane (within 1 m; see `noise_growth`)
+    base: float = 0.003  # lower pixels next to an object belong to it down to here (likewise)
     max_height: float = 0.5  # higher points are not on a tabletop
     voxel: float = 0.006  # points up to two voxels apart are one object
     depth_step: float = 0.02  # pixels whose 3x3 neighbours on objects span more depth are on an outline
@@ -63,7 +63,7 @@ def segment(frame: Frame, object_id: int | None = None, config: SegmentConfig | 
         raise ValueError(f"{where}: depth is NaN in all {frame.depth.size} pixels; check the depth sensor")
     points = backproject(frame)
     try:
-        table, on_table = support_plane(points, config.plane)
+        table, on_table = support_plane(points, frame.label, config.plane)
         if frame.label is None:
             masks = dict(enumerate(_standing(points, table, on_table, config), start=1))
         else:
@@ -110,7 +110,8 @@ def _standing(
     patch = _groups(points[on_plane] @ horizontal(plane).T, 0.02)
     table = points[on_plane][patch == np.bincount(patch).argmax()][::7]
     height, z = heights(points, plane), points[..., 2]
-    high = (height > config.above) & (height < config.max_height)
+    growth = noise_growth(points)
+    high = (height > config.above * growth) & (height < config.max_height)
     # Where one thing ends before another their outlines are left out, so that things that touch come apart. A level
     # face seen at a grazing angle spans much depth, but no height.
     steps = (
@@ -138,11 +139,11 @@ def _standing(
     owner = np.zeros(solid.shape, np.intp)
     for number, mask in enumerate(masks, start=1):
         owner[mask] = number
-    loose = (owner == 0) & (height > config.base) & (height < config.max_height)
+    loose = (owner == 0) & (height > config.base * growth) & (height < config.max_height)
     reach = np.where(high[loose], 2.0 * config.voxel, config.voxel)
     gap, at = cKDTree(points[owner > 0]).query(points[loose], distance_upper_bound=2.0 * config.voxel)
     owner[loose] = np.where(gap < reach, np.append(owner[owner > 0], 0)[at], 0)
-    return [_filled(owner == number, height, config) for number in range(1, len(masks) + 1)]
+    return [_filled(owner == number, height / growth, config) for number in range(1, len(masks) + 1)]
 
 
 def _groups(points: Float[np.ndarray, "n d"], voxel: float) -> Int[np.ndarray, "n"]:
@@ -241,7 +242,7 @@ def _statuses(
     config: SegmentConfig,
 ) -> tuple[Int[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """What each pixel says about one object, and which of the UNKNOWN ones see something else."""
-    distance, height = np.linalg.norm(points, axis=-1), heights(points, plane)
+    distance, height = np.linalg.norm(points, axis=-1), heights(points, plane) / noise_growth(points)
     measured = np.isfinite(distance)
     body = points[mask & measured & (height > config.base)]
     if not len(body):
