@@ -76,6 +76,8 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
         try:
             result = _infer(frame, found, prior, config, share, err)
         except ValueError as error:
+            if len(segments) == 1:
+                raise
             err.print(f"object {found.id} is left out: {error}", highlight=False, soft_wrap=True)
             complaint = error
             continue
@@ -134,7 +136,7 @@ def _progress(
     """A line that tells the stage, how far the tempering is, and how the sampler moves."""
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=24), TimeElapsedColumn())
     begun = time.monotonic()
-    with Progress(*columns, console=err, transient=True) as progress:
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as progress:
         task = progress.add_task(f"{name}: first, compiling" if budget is None or budget > 5 else name, total=1.0)
 
         def on_stage(info: StageInfo) -> None:

@@ -48,7 +48,7 @@ def train(options: Training, out: Console, err: Console) -> bool:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     state = None
     try:
-        with Progress(*columns, TimeRemainingColumn(), console=err) as progress:
+        with Progress(*columns, TimeRemainingColumn(), console=err, disable=not err.is_terminal) as progress:
             drawing = progress.add_task("pictures", total=options.objects)
             seeds = np.asarray(TRAIN_SEEDS[: options.objects])
             views = draw_views(

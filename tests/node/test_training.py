@@ -1,0 +1,86 @@
+"""`farside train` hands the recipe over, draws the curves, exports the weights, and can be stopped."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import node.training
+from node.__main__ import main
+from probnerf.store import load_prior
+from probnerf.train import TrainConfig
+from probnerf.views import ViewSet
+
+
+@dataclass
+class State:
+    """What of a training state is read."""
+
+    average: Any
+    step: int
+
+
+class Trainer:
+    """Stands for the training loop; stops with `error` after its first report, where there is one."""
+
+    def __init__(self) -> None:
+        self.error: BaseException | None = None
+        self.asked: dict[str, Any] = {}
+
+    def __call__(self, model: Any, views: ViewSet, likelihood: Any, config: TrainConfig, folder: Path) -> Iterator:
+        self.asked = {"views": views, "config": config, "likelihood": likelihood}
+        folder.mkdir(parents=True, exist_ok=True)
+        for step in (config.steps // 2, config.steps):
+            metrics = {"step": step, "loss": 3.0 / step, "fit": -1.0, "kl": 2.0}
+            with (folder / "history.jsonl").open("a") as file:
+                file.write(json.dumps(metrics) + "\n")
+            yield State(model, step), metrics
+            if self.error is not None:
+                raise self.error
+
+
+@pytest.fixture
+def trainer(monkeypatch: pytest.MonkeyPatch) -> Trainer:
+    stand_in = Trainer()
+    monkeypatch.setattr(node.training.training, "train", stand_in)
+    return stand_in
+
+
+def run(folder: Path, *more: str) -> int:
+    sizes = ["--preset", "tiny", "--objects", "3", "--pictures", "2", "--steps", "10", "--seed", "4"]
+    return main(["train", "--out", str(folder), *sizes, *more])
+
+
+def test_the_recipe_is_handed_over_and_the_weights_exported(
+    tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture
+) -> None:
+    folder = tmp_path / "runs" / "a"
+    assert run(folder) == 0
+    assert trainer.asked["config"] == TrainConfig(steps=10, seed=4)
+    views = trainer.asked["views"]
+    assert np.array_equal(views.seeds, [0, 1, 2]) and views.rgb.shape == (3, 2, 16, 16, 3)
+    prior = load_prior(folder / "prior.safetensors", preset="tiny")
+    assert prior.metadata["seeds"] == [0, 3] and prior.metadata["steps"] == 10
+    assert prior.metadata["recipe"]["seed"] == 4 and prior.metadata["revision"]
+    assert (folder / "curves.png").stat().st_size > 1000
+    said = capsys.readouterr().out
+    assert str(folder / "curves.png") in said and "farside bench prior --prior" in said
+
+
+def test_ctrl_c_leaves_the_curves(tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture) -> None:
+    trainer.error = KeyboardInterrupt()
+    assert run(tmp_path) == 130
+    assert (tmp_path / "curves.png").is_file() and not (tmp_path / "prior.safetensors").exists()
+    assert "the same command goes on from the last checkpoint" in capsys.readouterr().out
+
+
+def test_a_loss_that_is_no_number_is_one_line(tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture) -> None:
+    trainer.error = FloatingPointError("loss is nan at step 5; checkpoint.eqx holds an earlier step")
+    assert run(tmp_path) == 1
+    assert capsys.readouterr().err == f"farside: error: {trainer.error}\n"
+    assert run(tmp_path, "--objects", "0") == 1
+    assert "--objects is 0; give 1 to 1000000" in capsys.readouterr().err
