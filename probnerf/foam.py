@@ -96,7 +96,9 @@ def composite(sigma: Float[Array, "n m"], t: Float[Array, "n m"], opacity_per_de
     total = jnp.cumsum(tau, axis=-1)
     # log(1 - exp(-tau)) is -inf at tau = 0: the floor keeps the value finite and the gradient alive for empty rays
     log_alpha = jnp.log(-jnp.expm1(-jnp.maximum(tau, 1e-12)))
-    log_weight = jnp.where(valid, log_alpha - (total - tau), -1e4)
+    # shifted, not total - tau: before a very dense face that difference is all rounding
+    before = jnp.concatenate([jnp.zeros_like(total[..., :1]), total[..., :-1]], axis=-1)
+    log_weight = jnp.where(valid, log_alpha - before, -1e4)
     return FaceWeights(log_weight=log_weight, log_transmittance=-total)
 
 

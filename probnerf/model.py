@@ -147,13 +147,12 @@ def pixel_terms(
         directions = pose.to_object_direction(directions)
     colour = field.colour(weights, points[:n_colour], directions, sigma[:n_colour])
     w = jnp.exp(log_w)
-    opacity = jnp.sum(w, axis=-1, keepdims=True)
-    mean = (jnp.einsum("nm,nmc->nc", w, colour) + 0.5e-3) / (opacity + 1e-3)  # grey where nothing is hit
+    mean = mean_colour(jnp.einsum("nm,nmc->nc", w, colour), jnp.sum(w, axis=-1, keepdims=True))
     s = likelihood.colour_sigma
-    colour_term = jnp.sum(
-        -0.5 * ((observation.rgb[:n_colour] - mean) / s) ** 2 - jnp.log(s) - 0.5 * jnp.log(2 * jnp.pi), axis=-1
-    )
-    as_object = as_object + jnp.where(observation.rgb_valid[:n_colour], colour_term, 0.0)
+    seen = observation.rgb_valid[:n_colour]
+    difference = jnp.where(seen[:, None], observation.rgb[:n_colour] - mean, 0.0)  # no NaN may reach the gradient
+    colour_term = jnp.sum(-0.5 * (difference / s) ** 2 - jnp.log(s) - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
+    as_object = as_object + jnp.where(seen, colour_term, 0.0)
 
     # FREE and UNKNOWN: the object is not in front of the measured end (transmittance up to `limit`)
     before = t <= observation.limit[:, None]
@@ -166,6 +165,11 @@ def pixel_terms(
     is_object = jnp.zeros_like(status, dtype=bool).at[:n_colour].set(status[:n_colour] == OBJECT)
     as_object = jnp.zeros_like(as_empty).at[:n_colour].set(as_object)
     return jnp.where(is_object, as_object, jnp.where((status == FREE) | says, as_empty, 0.0))
+
+
+def mean_colour(premultiplied: Float[Array, "n 3"], opacity: Float[Array, "n 1"]) -> Float[Array, "n 3"]:
+    """Sum w_i c_i / O: a pixel's expected colour given a hit; grey where nothing is hit."""
+    return (premultiplied + 0.5e-3) / (opacity + 1e-3)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
