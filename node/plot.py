@@ -185,8 +185,8 @@ def _add_bar(figure: Figure, colours: str | Colormap, top: float, axes: list[Axe
 
 def _write_summary(ax: Axes, h: Hypotheses) -> None:
     for i, (name, value) in enumerate(figures(h).items()):
-        ax.text(0.03, 0.95 - 0.08 * i, name, fontsize=10, color="#666666", transform=ax.transAxes)
-        ax.text(0.38, 0.95 - 0.08 * i, value, fontsize=10, transform=ax.transAxes)
+        ax.text(0.03, 0.95 - 0.08 * i, name, fontsize=9, color="#666666", transform=ax.transAxes)
+        ax.text(0.36, 0.95 - 0.08 * i, value, fontsize=9, transform=ax.transAxes)
     doubts = "\n".join(textwrap.fill(line, 44) for line in warnings(h))
     ax.text(0.03, 0.36, doubts, va="top", fontsize=9, color="#b03020", transform=ax.transAxes)
     handles = [
