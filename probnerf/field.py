@@ -55,8 +55,8 @@ def _polynomial(y: Float[Array, "..."], coefficients: tuple[float, ...]) -> Floa
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(1,))
-def encode(x: Float[Array, "3 n"], octaves: int) -> Float[Array, "e n"]:
-    """[x, sin(2^j pi x), cos(2^j pi x)], j < octaves: 3 (1 + 2 octaves) features, points last (paper, appendix B).
+def encode(x: Float[Array, "c n"], octaves: int) -> Float[Array, "e n"]:
+    """[x, sin(2^j pi x), cos(2^j pi x)], j < octaves: c (1 + 2 octaves) features, points last (paper, appendix B).
 
     The argument is reduced exactly every third octave with double-angle steps between: a recurrence alone loses 1e-3 by
     the tenth octave in float32. The gradient reuses the features: d sin = 2^j pi cos.
@@ -76,24 +76,29 @@ def _encode_forward(x, octaves):
 
 
 def _encode_backward(octaves, features, g):
-    gradient = g[:3]
+    c = features.shape[0] // (1 + 2 * octaves)
+    gradient = g[:c]
     for j in range(octaves):
-        i = 3 + 6 * j
-        sine, cosine = features[i : i + 3], features[i + 3 : i + 6]
-        gradient += (2.0**j * jnp.pi) * (g[i : i + 3] * cosine - g[i + 3 : i + 6] * sine)
+        sine, cosine = slice(c + 2 * c * j, 2 * c + 2 * c * j), slice(2 * c + 2 * c * j, 3 * c + 2 * c * j)
+        gradient += (2.0**j * jnp.pi) * (g[sine] * features[cosine] - g[cosine] * features[sine])
     return (gradient,)
 
 
 encode.defvjp(_encode_forward, _encode_backward)
 
 
-def encoded_size(octaves: int) -> int:
-    """Features of one 3-vector."""
-    return 3 * (1 + 2 * octaves)
+def encoded_size(octaves: int, channels: int = 3) -> int:
+    """Features of one point of so many channels."""
+    return channels * (1 + 2 * octaves)
 
 
-def _octave_scale(octaves: int) -> np.ndarray:
-    return np.concatenate([np.ones(3), np.repeat(2.0 ** (-0.75 * np.arange(octaves)), 6)])
+def with_radius(x: Float[Array, "3 n"]) -> Float[Array, "4 n"]:
+    """(x, y, z, r): the distance from the body's axis as a fourth coordinate; smoothed within 0.01 of it."""
+    return jnp.concatenate([x, jnp.sqrt(x[:1] ** 2 + x[1:2] ** 2 + 1e-4)], axis=0)
+
+
+def _octave_scale(octaves: int, channels: int) -> np.ndarray:
+    return np.concatenate([np.ones(channels), np.repeat(2.0 ** (-0.75 * np.arange(octaves)), 2 * channels)])
 
 
 class MLPField(eqx.Module):
@@ -106,11 +111,13 @@ class MLPField(eqx.Module):
     octaves: int = eqx.field(static=True, default=10)
     direction_octaves: int = eqx.field(static=True, default=10)
     density_scale: float = eqx.field(static=True, default=64.0)  # sigma = density_scale * softplus(output)
+    radial: bool = eqx.field(static=True, default=False)  # also encode the distance from the axis (not in the paper)
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:
         """Kernel and bias shapes in the order of the flat vector: density MLP, then colour MLP."""
-        position, direction, h = encoded_size(self.octaves), encoded_size(self.direction_octaves), self.width
+        position, direction = encoded_size(self.octaves, 3 + self.radial), encoded_size(self.direction_octaves)
+        h = self.width
         layers = [(position, h), (h, h), (h, 1), (position + direction + 1, h), (h, h), (h, 3)]
         return [shape for kernel in layers for shape in (kernel, kernel[1:])]
 
@@ -129,10 +136,10 @@ class MLPField(eqx.Module):
         for shape in self.shapes:
             fan_in = shape[0] if len(shape) == 2 else fan_in
             scale.append(np.full(shape, math.sqrt(2.0 / fan_in)))
-        for index, encodings in ((0, [self.octaves]), (6, [self.octaves, self.direction_octaves])):
-            rows = [_octave_scale(octaves) for octaves in encodings]
-            rows.append(np.ones(scale[index].shape[0] - sum(map(len, rows))))
-            scale[index] *= np.concatenate(rows)[:, None]
+        place, view = _octave_scale(self.octaves, 3 + self.radial), _octave_scale(self.direction_octaves, 3)
+        for index, rows in ((0, [place]), (6, [place, view])):
+            rest = np.ones(scale[index].shape[0] - sum(map(len, rows)))
+            scale[index] *= np.concatenate([*rows, rest])[:, None]
         return np.concatenate([part.ravel() for part in scale]).astype(np.float32)
 
     def unpack(self, weights: Float[Array, "d"]) -> list[Array]:
@@ -144,10 +151,14 @@ class MLPField(eqx.Module):
             start = end
         return parts
 
+    def _place(self, points: Float[Array, "... 3"]) -> Float[Array, "e n"]:
+        x = _columns(points)
+        return encode(with_radius(x) if self.radial else x, self.octaves)
+
     def density(self, weights: Float[Array, "d"], points: Float[Array, "... 3"]) -> Float[Array, "..."]:
         """sigma = density_scale * softplus(MLP(encode(x)))."""
         k0, b0, k1, b1, k2, b2, *_ = self.unpack(weights)
-        output = _mlp(encode(_columns(points), self.octaves), k0, b0, k1, b1, k2, b2)
+        output = _mlp(self._place(points), k0, b0, k1, b1, k2, b2)
         return self.density_scale * jax.nn.softplus(output[0]).reshape(points.shape[:-1])
 
     def colour(
@@ -159,9 +170,8 @@ class MLPField(eqx.Module):
     ) -> Float[Array, "... 3"]:
         """RGB from encode(x), encode(v) and log(1 + sigma) (its logarithm: sigma spans 0 to thousands)."""
         *_, k0, b0, k1, b1, k2, b2 = self.unpack(weights)
-        position, direction = _columns(points), _columns(directions)
-        seen = encode(direction, self.direction_octaves)
-        inputs = [encode(position, self.octaves), seen, jnp.log1p(sigma).reshape(1, -1)]
+        seen = encode(_columns(directions), self.direction_octaves)
+        inputs = [self._place(points), seen, jnp.log1p(sigma).reshape(1, -1)]
         output = _mlp(jnp.concatenate(inputs, axis=0), k0, b0, k1, b1, k2, b2)
         return jax.nn.sigmoid(output).T.reshape(points.shape)
 

@@ -17,7 +17,7 @@ from probnerf.field import MLPField, encoded_size
 
 CAMERA_FEATURES = 13  # rotation (9), position (3), tangent of the half field of view
 POINT_OCTAVES = 2  # of the encoding of each pixel's place in the object frame
-IMAGE_CHANNELS = 6 + encoded_size(POINT_OCTAVES)  # rgb; object, unknown and range masks; the place
+IMAGE_CHANNELS = 6 + encoded_size(POINT_OCTAVES, 4)  # rgb; object, unknown and range masks; the place
 
 
 @dataclass(frozen=True)
@@ -34,18 +34,21 @@ class Preset:
     lattice: int  # G
     image_size: int  # encoder input, pixels
     encoder_channels: tuple[int, ...]
+    radial: bool = False  # the field also sees the distance from the body's axis
 
     @property
     def field(self) -> MLPField:
         """The field whose weights the hypernetwork makes."""
-        return MLPField(width=self.width, octaves=self.octaves, direction_octaves=self.direction_octaves)
+        return MLPField(
+            width=self.width, octaves=self.octaves, direction_octaves=self.direction_octaves, radial=self.radial
+        )
 
 
 PRESETS = {
     preset.name: preset
     for preset in (
         Preset("paper", 128, 64, 10, 10, 512, 512, 128, 128, (32, 64, 128, 128, 128)),
-        Preset("small", 48, 48, 6, 1, 128, 256, 32, 32, (24, 32, 48, 64, 128)),
+        Preset("small", 48, 48, 6, 1, 128, 256, 32, 32, (24, 32, 48, 64, 128), radial=True),
         Preset("tiny", 4, 8, 2, 1, 16, 16, 8, 16, (4, 4, 4, 4, 4)),  # for tests
     )
 }
@@ -220,6 +223,31 @@ class Encoder(eqx.Module):
         prior = jnp.exp(self.prior_log_precision)
         total = prior + jnp.sum(precision, axis=0)
         return (prior * self.prior_mean + jnp.sum(precision * mean, axis=0)) / total, total
+
+
+class Recognition(eqx.Module):
+    """q(z | the object's exact description): training's scaffold, thrown away afterwards.
+
+    The paper trains the decoder through the picture encoder; a procedural family knows its objects, and a decoder that
+    is told z cleanly learns several times faster. The picture encoder then learns to give the same z.
+    """
+
+    hidden: TwoLayer
+    output: eqx.nn.Linear
+    prior_log_precision: Float[Array, "k"]
+
+    def __init__(self, inputs: int, latent: int, hidden: int, key: PRNGKeyArray):
+        k0, k1 = jax.random.split(key)
+        self.hidden = TwoLayer(inputs, hidden, hidden, k0)
+        self.output = eqx.nn.Linear(hidden, 2 * latent, key=k1)
+        self.prior_log_precision = jnp.zeros(latent)
+
+    def __call__(self, description: Float[Array, "p"]) -> tuple[Float[Array, "k"], Float[Array, "k"]]:
+        """Mean and precision of z."""
+        mean, log_precision = jnp.split(self.output(jax.nn.relu(self.hidden(description))), 2)
+        precision = jnp.exp(3.0 + 6.0 * jnp.tanh(log_precision / 6.0))
+        total = precision + jnp.exp(self.prior_log_precision)
+        return precision * mean / total, total
 
 
 class ProbNeRF(eqx.Module):

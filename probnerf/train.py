@@ -10,6 +10,7 @@ weighted by each stratum's size, so that the pixel term is an unbiased estimate 
 import json
 import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,9 +24,9 @@ from jaxtyping import Array, Float
 
 from probnerf import foam
 from probnerf.batches import Batch, draw_batch, solid_points, strata_of
-from probnerf.families.tabletop import sample_objects, signed_distance
+from probnerf.families.tabletop import description, sample_object, sample_objects, signed_distance
 from probnerf.model import Likelihood, map_with_gradient, pixel_terms
-from probnerf.prior import ProbNeRF
+from probnerf.prior import ProbNeRF, Recognition
 from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
 from probnerf.views import ViewSet, camera_features, encoder_image
 
@@ -34,18 +35,19 @@ from probnerf.views import ViewSet, camera_features, encoder_image
 class TrainConfig:
     """The recipe. Steps count optimiser updates; every number travels with the weights."""
 
-    steps: int = 30_000
-    solid_steps: int = 15_000  # of these, the first so many use solid samples alone
-    batch: int = 16  # objects per step in the solid phase
+    steps: int = 26_000
+    solid_steps: int = 24_000  # of these, the first so many use solid samples alone
+    batch: int = 32  # objects per step in the solid phase
     ray_batch: int = 8  # objects per step afterwards
-    views: int = 4  # encoder views per object; a random number of them is used
+    encode_objects: int = 8  # of a batch, those whose views the encoder sees
+    views: int = 3  # encoder views per object; a random number of them is used
     object_rays: int = 96
     near_rays: int = 48  # free pixels within 2 pixels of the object
     far_rays: int = 16
     points: int = 768  # solid samples per object, near visible surfaces and uniform
     effective_rays: float = 1500.0  # N_rays: independent residuals per object
     effective_points: float = 3000.0  # N_points
-    learning_rate: float = 1.5e-3
+    learning_rate: float = 2e-3
     final_learning_rate: float = 2e-5
     warmup: int = 500
     kl_warmup: int = 8_000
@@ -73,6 +75,14 @@ def kl_estimate(model: ProbNeRF, z: Array, mean: Array, precision: Array) -> Flo
     z_tilde, log_det = model.flow.inverse(z)
     log_q = 0.5 * jnp.sum(jnp.log(precision) - precision * (z - mean) ** 2)
     return log_q - (log_det - 0.5 * jnp.sum(z_tilde**2))
+
+
+def encoder_loss(model: ProbNeRF, batch: Batch, z: Float[Array, "b k"], objects: int) -> Float[Array, ""]:
+    """-log q(z | views) of the recognised z: the encoder learns to cover what views leave open, not to pick a mode."""
+    few = jax.tree.map(lambda a: a[:objects], batch)
+    mean, precision = encode(model, few)
+    z = jax.lax.stop_gradient(z[:objects])
+    return -0.5 * jnp.mean(jnp.sum(jnp.log(precision) - precision * (z - mean) ** 2, axis=-1))
 
 
 class _PerObject(eqx.Module):
@@ -145,11 +155,18 @@ def _to_view(pose: Pose, p: Array) -> Array:
 
 
 def loss(
-    model: ProbNeRF, batch: Batch, key: Array, kl_weight: Array, likelihood: Likelihood, config: TrainConfig, rays: bool
+    networks: tuple[ProbNeRF, Recognition],
+    batch: Batch,
+    key: Array,
+    kl_weight: Array,
+    likelihood: Likelihood,
+    config: TrainConfig,
+    rays: bool,
 ) -> tuple[Array, dict[str, Array]]:
-    """Negative ELBO per object and its parts."""
+    """Negative ELBO per object, with q(z) by recognition, plus the picture encoder's loss; and the parts."""
+    model, recognition = networks
     k0, k1 = jax.random.split(key)
-    mean, precision = encode(model, batch)
+    mean, precision = jax.vmap(lambda o: recognition(description(o)))(batch.objects)
     z = mean + jax.random.normal(k0, mean.shape) / jnp.sqrt(precision)
     kl = jnp.mean(jax.vmap(kl_estimate, in_axes=(None, 0, 0, 0))(model, z, mean, precision))
     weights = jax.vmap(model.hyper)(z)
@@ -162,7 +179,8 @@ def loss(
     fit = jnp.mean(
         map_with_gradient(_Bound(terms, (model.field, likelihood, config, 0.3)), config.map_batch, None, each, weights)
     )
-    return kl_weight * kl - fit, {"fit": fit, "kl": kl}
+    encoder = encoder_loss(model, batch, z, min(config.encode_objects, z.shape[0]))
+    return kl_weight * kl - fit + encoder, {"fit": fit, "kl": kl, "encoder": encoder}
 
 
 @dataclass(frozen=True)
@@ -180,6 +198,7 @@ class TrainState(eqx.Module):
     """Everything that a resumed run needs; batches and keys are functions of the step."""
 
     model: ProbNeRF
+    recognition: Recognition
     average: ProbNeRF
     optimiser: optax.OptState
     step: Array
@@ -196,7 +215,11 @@ def optimiser_of(config: TrainConfig) -> optax.GradientTransformation:
 def initial_state(model: ProbNeRF, config: TrainConfig) -> TrainState:
     """A fresh run."""
     average = jax.tree.map(jnp.copy, model)  # its own buffers: a step gives its inputs away
-    return TrainState(model, average, optimiser_of(config).init(model), jnp.zeros((), jnp.int32))
+    size = description(sample_object(0)).shape[0]
+    key = jax.random.fold_in(jax.random.key(config.seed), 1)
+    recognition = Recognition(size, model.latent, model.preset.hyper_hidden, key)
+    optimiser = optimiser_of(config).init((model, recognition))
+    return TrainState(model, recognition, average, optimiser, jnp.zeros((), jnp.int32))
 
 
 @eqx.filter_jit(donate="all-except-first")
@@ -208,13 +231,13 @@ def train_step(
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
     kl_weight = jnp.clip(state.step / config.kl_warmup, 0.02, 1.0)
     (value, parts), gradient = jax.value_and_grad(loss, has_aux=True)(
-        state.model, batch, key, kl_weight, likelihood, config, rays
+        (state.model, state.recognition), batch, key, kl_weight, likelihood, config, rays
     )
     update, optimiser = optimiser_of(config).update(gradient, state.optimiser)
-    model = optax.apply_updates(state.model, update)
+    model, recognition = optax.apply_updates((state.model, state.recognition), update)
     decay = jnp.minimum(config.average, (1.0 + state.step) / (10.0 + state.step))
     average = jax.tree.map(lambda a, b: decay * a + (1.0 - decay) * b, state.average, model)
-    return TrainState(model, average, optimiser, state.step + 1), {"loss": value, **parts}
+    return TrainState(model, recognition, average, optimiser, state.step + 1), {"loss": value, **parts}
 
 
 def save_checkpoint(path: Path, state: TrainState) -> None:
@@ -250,19 +273,26 @@ def train(
     objects = sample_objects([int(s) for s in views.seeds])
     strata = strata_of(views)
     start = int(state.step)
-    for step in range(start, config.steps):
-        rays = step >= config.solid_steps
-        batch = draw_batch(views, objects, strata, config, step, config.ray_batch if rays else config.batch)
-        state, parts = train_step((likelihood, config, rays), state, batch)
-        done = step + 1
-        if done % config.log_every == 0 or done == config.steps:
-            metrics = {k: float(v) for k, v in parts.items()}
-            if not np.isfinite(metrics["loss"]):
-                raise FloatingPointError(
-                    f"loss is {metrics['loss']} at step {done}; {checkpoint} holds an earlier step"
-                )
-            with open(history, "a") as file:
-                file.write(json.dumps({"step": done, "rays": rays, **metrics}) + "\n")
-            if done % config.checkpoint_every == 0 or done == config.steps:
-                save_checkpoint(checkpoint, state)
-            yield state, {"step": done, **metrics}
+
+    def batch_of(step: int) -> Batch:
+        size = config.ray_batch if step >= config.solid_steps else config.batch
+        return draw_batch(views, objects, strata, config, step, size)
+
+    with ThreadPoolExecutor(1) as drawer:  # the next batch is drawn while this one is used
+        coming = drawer.submit(batch_of, start)
+        for step in range(start, config.steps):
+            batch = coming.result()
+            coming = drawer.submit(batch_of, step + 1)
+            state, parts = train_step((likelihood, config, step >= config.solid_steps), state, batch)
+            done = step + 1
+            if done % config.log_every == 0 or done == config.steps:
+                metrics = {k: float(v) for k, v in parts.items()}
+                if not np.isfinite(metrics["loss"]):
+                    raise FloatingPointError(
+                        f"loss is {metrics['loss']} at step {done}; {checkpoint} holds an earlier step"
+                    )
+                with open(history, "a") as file:
+                    file.write(json.dumps({"step": done, "rays": step >= config.solid_steps, **metrics}) + "\n")
+                if done % config.checkpoint_every == 0 or done == config.steps:
+                    save_checkpoint(checkpoint, state)
+                yield state, {"step": done, **metrics}

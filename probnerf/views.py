@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from probnerf.families.render import look_at, pinhole_rays, trace_batch
 from probnerf.families.tabletop import sample_objects
-from probnerf.field import encode
+from probnerf.field import encode, with_radius
 from probnerf.prior import POINT_OCTAVES
 from probnerf.types import Rays
 
@@ -97,7 +97,7 @@ def encoder_image(
     T_object_camera: Float[Array, "4 4"],
     tan_half_fov: Float[Array, ""],
 ) -> Float[Array, "c s s"]:
-    """Channels first: masked colour, object mask, unknown mask, and where each pixel lies in the object frame, encoded.
+    """Channels first: masked colour, masks (object, unknown, range), and where each pixel lies in the object frame.
 
     Range becomes a point in canonical coordinates, so that the network need not learn to turn views: pooled features say
     what is where, whatever the camera. Without range (distance < 0 marks an object pixel without one) they are 0.
@@ -111,7 +111,8 @@ def encoder_image(
     rays = rays / jnp.linalg.norm(rays, axis=-1, keepdims=True) @ T_object_camera[:3, :3].T
     points = T_object_camera[:3, 3] + distance[..., None] * rays
     has_point = mask & (distance > 0.0)
-    encoded = encode(jnp.where(has_point[..., None], points, 0.0).reshape(-1, 3).T, POINT_OCTAVES).reshape(-1, size, size)
+    place = with_radius(jnp.where(has_point[..., None], points, 0.0).reshape(-1, 3).T)
+    encoded = encode(place, POINT_OCTAVES).reshape(-1, size, size)
     return jnp.concatenate(
         [
             (jnp.moveaxis(rgb, -1, 0) - 0.5) * mask,

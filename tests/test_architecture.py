@@ -36,7 +36,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "jax": ("probnerf/*", "perception/observe.py", "perception/controller.py", "benchmarks/*"),
     "equinox": ("probnerf/*", "benchmarks/*"),
     "optax": ("probnerf/train.py", "probnerf/variational.py", "probnerf/baselines/*"),
-    "safetensors": ("probnerf/model.py",),
+    "safetensors": ("probnerf/store.py",),
     "blackjax": (),  # an independent sampler to test against
     "cv2": ("calibration/*", "perception/*"),
     "scipy": ("probnerf/occupancy.py", "probnerf/batches.py", "probnerf/metrics.py", "perception/*", "benchmarks/*"),

@@ -11,6 +11,7 @@ Symbols: (r, z) are cylindrical coordinates; s in [0, 1] is the height as a frac
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -19,9 +20,11 @@ from probnerf.families.draw import (
     ABSENT,
     BANDED,
     CARTON,
+    KINDS,
     LABELLED,
     OUTER_VERTICES,
     PRINTED,
+    TEXTURES,
     draw,
 )
 from probnerf.types import BASE_Z
@@ -242,3 +245,30 @@ def sample_objects(seeds: Sequence[int], slack: float = 1.0) -> TabletopObject:
     """The objects of several seeds, stacked along a leading axis."""
     samples = [draw(int(seed), slack) for seed in seeds]
     return _as_object({k: np.stack([np.asarray(s[k]) for s in samples]) for k in samples[0]})
+
+
+def description(obj: TabletopObject) -> Float[Array, "p"]:
+    """Everything that shape and looks depend on, as one vector of numbers of order 1: what training is told of it."""
+    parts = [
+        3.0 * obj.outline,
+        3.0 * obj.box,
+        2.0 * obj.tube,
+        10.0 * obj.tube_section,
+        obj.spout,
+        2.0 * obj.paint - 1.0,
+        obj.bands,
+        obj.label,
+        0.1 * obj.waves,
+        obj.pattern_level,
+        obj.lid_start,
+        obj.light,
+        obj.ambient,
+        obj.lamp,
+        2.0 * jax.nn.one_hot(obj.kind, len(KINDS)),
+        2.0 * jax.nn.one_hot(obj.texture, len(TEXTURES)),
+        2.0 * obj.has_handle,
+        2.0 * obj.is_open,
+        10.0 * jnp.log(obj.scale),
+        20.0 * obj.shift,
+    ]
+    return jnp.concatenate([jnp.clip(jnp.ravel(part).astype(jnp.float32), -5.0, 5.0) for part in parts])
