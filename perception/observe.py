@@ -23,15 +23,15 @@ NO_LIMIT = 1e3  # cube units: a ray that misses the object without an end
 class ObserveConfig:
     """How a segment becomes an Observation. Ray counts are fixed, so that no frame compiles anew."""
 
-    colour_rays: int = 192  # OBJECT pixels
-    free_rays: int = 160  # FREE pixels, half of them near the outline
-    occluder_rays: int = 32  # UNKNOWN pixels that see something nearer
+    colour_rays: int = 64  # OBJECT pixels
+    free_rays: int = 52  # FREE pixels, half of them near the outline
+    occluder_rays: int = 12  # UNKNOWN pixels that see something nearer
     range_sigma_a: float = 1.0e-3  # m; sigma of a range d: a + b d^2
     range_sigma_b: float = 2.0e-3  # 1/m
     cube: float = 1.2  # half side (cube units) of the box that a ray must meet to be worth asking
     outline_band: float = 0.25  # cube units either side of the mask that count as near its outline
-    xy_sigma: float = 0.10  # cube units; prior width of the body's axis about the guess
-    log_scale_sigma: float = 0.12
+    xy_sigma: float = 0.06  # cube units; prior width of the body's axis about the guess
+    log_scale_sigma: float = 0.06
     hidden_sigma: float = 0.3  # added to all widths, times the share of the outline that is hidden or cut off
     side_sigma: float = 0.08  # added to all widths where the camera does not look down on the top
     rim_reach: float = 0.02  # m; a rim pixel this near its neighbour inside the outline is of the object

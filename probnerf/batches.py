@@ -28,22 +28,25 @@ class BatchConfig(Protocol):
     def far_rays(self) -> int: ...
 
 
+Data = Array | np.ndarray  # drawn on the host, used on the device
+
+
 class Batch(eqx.Module):
     """One step's data, all arrays with a leading object axis."""
 
     objects: TabletopObject
-    rgb: Array  # u8 [b, j, s, s, 3]
-    distance: Array  # f32 [b, j, s, s]
-    unknown: Array  # bool [b, j, s, s]
-    used: Array  # f32 [b, j]
-    T_object_camera: Array  # f32 [b, j, 4, 4]
-    tan_half_fov: Array  # f32 [b, j]
-    origin: Array  # f32 [b, n, 3]
-    direction: Array  # f32 [b, n, 3]
-    ray_rgb: Array  # f32 [b, n, 3]
-    ray_range: Array  # f32 [b, n], 0 on a miss
-    ray_weight: Array  # f32 [b, n], sums to about 1: the unbiased mean over all pixels of all views
-    turn: Array  # f32 [b, 4] yaw, x, y, log-scale of the object over the standing lattice
+    rgb: Data  # u8 [b, j, s, s, 3]
+    distance: Data  # f32 [b, j, s, s]
+    unknown: Data  # bool [b, j, s, s]
+    used: Data  # f32 [b, j]
+    T_object_camera: Data  # f32 [b, j, 4, 4]
+    tan_half_fov: Data  # f32 [b, j]
+    origin: Data  # f32 [b, n, 3]
+    direction: Data  # f32 [b, n, 3]
+    ray_rgb: Data  # f32 [b, n, 3]
+    ray_range: Data  # f32 [b, n], 0 on a miss
+    ray_weight: Data  # f32 [b, n], sums to about 1: the unbiased mean over all pixels of all views
+    turn: Data  # f32 [b, 4] yaw, x, y, log-scale of the object over the standing lattice
 
 
 class Strata(eqx.Module):
@@ -135,14 +138,37 @@ def _half_planes(rng: np.random.Generator, b: int, j: int, s: int) -> np.ndarray
 
 
 def solid_points(batch: Batch, key: Array, count: int) -> Float[Array, "b p 3"]:
-    """Where solid samples are taken: two thirds within 0.05 of visible surfaces, the rest uniform around the object."""
-    near = 2 * count // 3
-    k0, k1, k2 = jax.random.split(key, 3)
+    """Where solid samples are taken: half near visible surfaces, a quarter around the handle, the rest uniform.
+
+    A handle is a hundredth of the cube: without samples of its own a decoder learns it last. Objects without one get
+    uniform samples instead.
+    """
+    near, handle = count // 2, count // 4
+    keys = jax.random.split(key, 6)
     b, n = batch.ray_range.shape
     surface = batch.origin + batch.ray_range[..., None] * batch.direction
-    index = jax.random.randint(k0, (b, near), 0, n)
+    index = jax.random.randint(keys[0], (b, near), 0, n)
     hit = jnp.take_along_axis(batch.ray_range, index, axis=1) > 0
-    chosen = jnp.take_along_axis(surface, index[..., None], axis=1)
-    u = jax.random.uniform(k2, (b, count, 3), minval=-1.0, maxval=1.0)
-    near_points = chosen + 0.05 * jax.random.normal(k1, (b, near, 3))
-    return jnp.concatenate([jnp.where(hit[..., None], near_points, u[:, :near]), u[:, near:]], axis=1)
+    near_points = jnp.take_along_axis(surface, index[..., None], axis=1) + 0.05 * jax.random.normal(
+        keys[1], (b, near, 3)
+    )
+    uniform = jax.random.uniform(keys[2], (b, count, 3), minval=-1.0, maxval=1.0)
+
+    # along the handle's centre line, which lies in the plane y = 0
+    last = batch.objects.tube.shape[1] - 1
+    u = last * jax.random.uniform(keys[3], (b, handle))
+    low = jnp.minimum(u.astype(jnp.int32), last - 1)
+    start = jnp.take_along_axis(batch.objects.tube, low[..., None], axis=1)
+    end = jnp.take_along_axis(batch.objects.tube, low[..., None] + 1, axis=1)
+    line = start + (u - low)[..., None] * (end - start)
+    line = jnp.stack([line[..., 0], jnp.zeros_like(u), line[..., 1]], axis=-1)
+    around = line + 0.1 * jax.random.normal(keys[4], line.shape)
+
+    return jnp.concatenate(
+        [
+            jnp.where(hit[..., None], near_points, uniform[:, :near]),
+            jnp.where(batch.objects.has_handle[:, None, None], around, uniform[:, near : near + handle]),
+            uniform[:, near + handle :],
+        ],
+        axis=1,
+    )

@@ -35,8 +35,8 @@ from probnerf.views import ViewSet, camera_features, encoder_image
 class TrainConfig:
     """The recipe. Steps count optimiser updates; every number travels with the weights."""
 
-    steps: int = 26_000
-    solid_steps: int = 24_000  # of these, the first so many use solid samples alone
+    steps: int = 25_000
+    solid_steps: int = 23_000  # of these, the first so many use solid samples alone
     batch: int = 32  # objects per step in the solid phase
     ray_batch: int = 8  # objects per step afterwards
     encode_objects: int = 8  # of a batch, those whose views the encoder sees
@@ -44,7 +44,7 @@ class TrainConfig:
     object_rays: int = 96
     near_rays: int = 48  # free pixels within 2 pixels of the object
     far_rays: int = 16
-    points: int = 768  # solid samples per object, near visible surfaces and uniform
+    points: int = 1024  # solid samples per object (see `solid_points`)
     effective_rays: float = 1500.0  # N_rays: independent residuals per object
     effective_points: float = 3000.0  # N_points
     learning_rate: float = 2e-3
@@ -172,9 +172,8 @@ def loss(
     weights = jax.vmap(model.hyper)(z)
     points = solid_points(batch, k1, config.points)
     solid = jax.vmap(signed_distance)(batch.objects, points) <= 0.0
-    each = _PerObject(
-        points, solid, batch.origin, batch.direction, batch.ray_rgb, batch.ray_range, batch.ray_weight, batch.turn
-    )
+    drawn = (batch.origin, batch.direction, batch.ray_rgb, batch.ray_range, batch.ray_weight, batch.turn)
+    each = _PerObject(points, solid, *map(jnp.asarray, drawn))
     terms = _ray_terms if rays else _solid_terms
     fit = jnp.mean(
         map_with_gradient(_Bound(terms, (model.field, likelihood, config, 0.3)), config.map_batch, None, each, weights)

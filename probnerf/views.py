@@ -99,8 +99,8 @@ def encoder_image(
 ) -> Float[Array, "c s s"]:
     """Channels first: masked colour, masks (object, unknown, range), and where each pixel lies in the object frame.
 
-    Range becomes a point in canonical coordinates, so that the network need not learn to turn views: pooled features say
-    what is where, whatever the camera. Without range (distance < 0 marks an object pixel without one) they are 0.
+    Range becomes a point in canonical coordinates, so that the network need not learn to turn views: pooled features
+    say what is where, whatever the camera. Without range (distance < 0 marks an object pixel without one) they are 0.
     """
     size = rgb.shape[0]
     known = unknown < 0.5

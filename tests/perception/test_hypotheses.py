@@ -4,6 +4,7 @@ import json
 import zipfile
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -81,7 +82,7 @@ def mixed() -> Hypotheses:
     return _hypotheses(rng.integers(0, 256, (4, GRID, GRID, GRID), np.uint8), [0.1, 0.4, 0.2, 0.3])
 
 
-def _same(a: object, b: object) -> bool:
+def _same(a: Any, b: Any) -> bool:
     if isinstance(a, ObjectFrame | Hypotheses):
         return all(_same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
     if isinstance(a, dict):

@@ -171,7 +171,7 @@ def test_colour_does_not_depend_on_the_view(one_of_each: TabletopObject) -> None
     rays = [pinhole_rays(T, 22.0, 16) for T in _cameras(count, 5)]
     origins, directions = (np.stack(part) for part in zip(*rays, strict=True))
     hit, distance, rgb = (np.asarray(leaf) for leaf in trace_batch(one_of_each, origins, directions))
-    moved = origins + np.float32([0.15, -0.1, 0.1])
+    moved = origins + np.array([0.15, -0.1, 0.1], np.float32)
     to_point = origins + np.where(hit, distance, 3.5)[..., None] * directions - moved
     length = np.linalg.norm(to_point, axis=-1)
     seen, other, other_rgb = (np.asarray(x) for x in trace_batch(one_of_each, moved, to_point / length[..., None]))
