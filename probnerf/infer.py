@@ -22,12 +22,19 @@ from probnerf.types import OBJECT, UNKNOWN, Observation, Pose, Posterior
 Method = Literal["tempered_smc", "annealed_hmc"]
 
 
+def quick_smc() -> TemperedSMCConfig:
+    """A population that two CPU cores move in seconds; `TemperedSMCConfig()` is the one that the laws are tested on."""
+    return TemperedSMCConfig(
+        particles=16, start_particles=192, moves=3, leapfrog_steps=4, ess_target=0.4, final_stages=1, keep=1
+    )
+
+
 @dataclass(frozen=True)
 class InferConfig:
     """Which sampler, how much of it, and the pixel likelihood's numbers."""
 
     method: Method = "tempered_smc"
-    smc: TemperedSMCConfig = field(default_factory=TemperedSMCConfig)
+    smc: TemperedSMCConfig = field(default_factory=quick_smc)
     hmc: AnnealedHMCConfig = field(default_factory=AnnealedHMCConfig)
     lattice: int = 32  # G: cubes per 2 units
     extent: float = 1.1  # the lattice covers [-extent, extent]^3: an object may be larger than its guessed cube
