@@ -1,4 +1,4 @@
-"""The foam renderer g(w, r): all density sits on the faces of a standing lattice of cubes (paper §2.5; SCIENCE §1).
+"""The foam renderer g(w, r): all density sits on the faces of a standing lattice of cubes (paper §2.5).
 
 Symbols: G lattice cubes per 2 units, so faces every 2/G; t_i sorted distances of a ray's crossings with the three
 families of faces; sigma_i density there; s the object's scale; tau_i = s sigma_i / G the optical depth of a face;
@@ -89,7 +89,7 @@ class FaceWeights(eqx.Module):
 def composite(sigma: Float[Array, "n m"], t: Float[Array, "n m"], opacity_per_density: Float[Array, ""]) -> FaceWeights:
     """Alpha-composite: tau_i = opacity_per_density * sigma_i, w_i = T_i (1 - exp(-tau_i)).
 
-    `opacity_per_density` is exp(log_scale)/G: a larger object has the same walls over more faces (SCIENCE §3).
+    `opacity_per_density` is exp(log_scale)/G: a larger object has the same walls over more faces.
     """
     valid = t < FAR
     tau = jnp.where(valid, sigma * opacity_per_density, 0.0)

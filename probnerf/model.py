@@ -66,7 +66,7 @@ class Likelihood(eqx.Module):
 
 
 def pose_of(latent: Float[Array, "5"], pose_sigma: Float[Array, "3"]) -> Pose:
-    """yaw = atan2(b, a); x, y, log-scale are standard normals times perception's widths (SCIENCE §3)."""
+    """yaw = atan2(b, a); x, y, log-scale are standard normals times perception's widths."""
     a, b = latent[..., 0], latent[..., 1]
     # atan2 has no gradient at the origin, a point of measure zero that float32 could still meet
     at_origin = (a * a + b * b) < 1e-12
@@ -114,7 +114,7 @@ def pixel_terms(
     observation: Observation,
     t: Float[Array, "n m"],
 ) -> Float[Array, "n"]:
-    """Each pixel's log density (SCIENCE §2): where its ray ends, is it the object, how far, which colour."""
+    """Each pixel's log density: where its ray ends, is it the object, how far, which colour."""
     n_colour = observation.colour_count
     points = foam.points_on_rays(observation.rays, t)
     scale = jnp.ones(())

@@ -1,4 +1,4 @@
-"""Where particles start: a defensive mixture of the prior and of the encoder's guess at every yaw (SCIENCE §4).
+"""Where particles start: a defensive mixture of the prior and of the encoder's guess at every yaw.
 
 The encoder needs the camera in the canonical object frame, which the unknown pose turns; so a proposal first draws the
 pose from its prior, then z~ given that pose: q(q) = share N(q; 0, I) + (1 - share) N(pose; 0, I) q(z~ | picture, pose).

@@ -1,7 +1,7 @@
 """ELBO training of a prior (paper §2.2): views and solid samples of procedural objects in, ProbNeRF weights out.
 
 An object's data are (a) pixels of its views, through the same joint pixel likelihood that inference uses, on a lattice
-that is turned, shifted and scaled at random (SCIENCE §3), and (b) solid samples: is a face at this point opaque? They
+that is turned, shifted and scaled at random, and (b) solid samples: is a face at this point opaque? They
 cost a tenth of a ray, so the first steps use them alone. Both are observations, the objective is an ELBO throughout:
 N_rays E[log p] + N_points E[log p] - weight KL. Pixels are drawn by strata (object, near it, elsewhere) and weighted by
 each stratum's size, so that the pixel term is an unbiased estimate of its mean over all pixels.

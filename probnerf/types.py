@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 # Height of the support plane in the cube, in the view frame and in the canonical object frame alike.
 BASE_Z = -0.75
 
-# Pixel statuses of an Observation (SCIENCE: object / free / unknown).
+# Pixel statuses of an Observation (object / free / unknown).
 UNKNOWN, OBJECT, FREE = 0, 1, 2
 
 
