@@ -39,23 +39,25 @@ def test_sine_and_cosine_are_right_far_from_zero():
     np.testing.assert_allclose(cosine, np.cos(np.pi * u.astype(np.float64)), atol=5e-7)
 
 
-def test_encoding_is_right_to_1e_5_at_ten_octaves():
-    x = np.random.default_rng(1).uniform(-1.3, 1.3, (3, 4096)).astype(np.float32)
+@pytest.mark.parametrize("channels", [3, 4])
+def test_encoding_is_right_to_1e_5_at_ten_octaves(channels):
+    x = np.random.default_rng(1).uniform(-1.3, 1.3, (channels, 4096)).astype(np.float32)
     x[:, :4] = [0.0, 1.0, -1.0, 0.5]
     features = jax.jit(encode, static_argnums=1)(jnp.asarray(x), 10)
-    assert features.shape == (encoded_size(10), 4096)
+    assert features.shape == (encoded_size(10, channels), 4096)
     np.testing.assert_allclose(features, _encode64(x, 10), atol=1e-5)
 
 
-def test_the_encoding_s_gradient_is_that_of_its_definition():
+@pytest.mark.parametrize("channels", [3, 4])
+def test_the_encoding_s_gradient_is_that_of_its_definition(channels):
     rng = np.random.default_rng(2)
-    x = rng.uniform(-1.2, 1.2, (3, 64)).astype(np.float32)
-    cotangent = rng.standard_normal((encoded_size(10), 64)).astype(np.float32)
+    x = rng.uniform(-1.2, 1.2, (channels, 64)).astype(np.float32)
+    cotangent = rng.standard_normal((encoded_size(10, channels), 64)).astype(np.float32)
     (gradient,) = jax.vjp(lambda p: encode(p, 10), jnp.asarray(x))[1](jnp.asarray(cotangent))
     step = 1e-7
     difference = (_encode64(x + np.float64(step), 10) - _encode64(x - np.float64(step), 10)) / (2 * step)
-    difference = difference.reshape(-1, 3, 64)  # features of one kind stand together, x, y, z within
-    expected = np.sum(cotangent.reshape(-1, 3, 64) * difference, axis=0)
+    difference = difference.reshape(-1, channels, 64)  # features of one kind stand together, x, y, z within
+    expected = np.sum(cotangent.reshape(-1, channels, 64) * difference, axis=0)
     np.testing.assert_allclose(gradient, expected, atol=2e-5 * np.abs(expected).max())
 
 
@@ -75,7 +77,7 @@ def test_density_is_never_negative_and_colour_lies_in_the_unit_interval():
 
 
 def test_colour_depends_on_direction_and_hardly_on_how_dense_a_dense_wall_is():
-    field = MLPField(width=8, octaves=2, direction_octaves=1)
+    field = MLPField(width=8, octaves=2, direction_octaves=1, radial=True)
     weights = jnp.asarray(np.random.default_rng(4).standard_normal(field.size).astype(np.float32))
     point, along = jnp.array([0.2, -0.1, 0.3]), jnp.array([1.0, 0.0, 0.0])
     colour = jax.jit(field.colour)

@@ -53,7 +53,8 @@ class Slow:
             direction = turn @ direction
         field = self.field
         k0, b0, k1, b1, k2, b2, k3, b3, k4, b4, k5, b5 = self.layers
-        position = _encode(point, field.octaves)
+        place = [*point, np.sqrt(point[0] ** 2 + point[1] ** 2 + 1e-4)] if field.radial else point
+        position = _encode(np.asarray(place), field.octaves)
         hidden = np.maximum(np.maximum(position @ k0 + b0, 0) @ k1 + b1, 0)
         u = np.clip(1 - max(np.abs(point).max() - 1, 5 * (BASE_Z - 0.02 - point[2])) / 0.1, 0, 1)
         sigma = field.density_scale * np.logaddexp(0, (hidden @ k2 + b2)[0]) * u**2 * (3 - 2 * u)
