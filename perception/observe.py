@@ -30,7 +30,7 @@ class ObserveConfig:
     range_sigma_b: float = 2.0e-3  # 1/m
     cube: float = 1.2  # half side (cube units) of the box that a ray must meet to be worth asking
     outline_band: float = 0.25  # cube units either side of the mask that count as near its outline
-    xy_sigma: float = 0.06  # cube units; prior width of the body's axis about the guess
+    xy_sigma: float = 0.08  # cube units; prior width of the body's axis about the guess
     log_scale_sigma: float = 0.06
     hidden_sigma: float = 0.3  # added to all widths, times the share of the outline that is hidden or cut off
     side_sigma: float = 0.08  # added to all widths where the camera does not look down on the top

@@ -12,7 +12,7 @@ from perception.source import Frame, read_frame_folder
 from probnerf.types import BASE_Z, FREE, OBJECT, UNKNOWN, Observation
 from tests.perception.cylinders import CAN, Cylinder, looking_down, picture, to_camera, to_world
 
-CONFIG = ObserveConfig()
+CONFIG = ObserveConfig(colour_rays=192, free_rays=160, occluder_rays=32)
 WIDE = Cylinder(0.03, -0.02, 0.08, 0.07)
 
 
@@ -23,7 +23,7 @@ def seen(
     T = looking_down(degrees, distance)
     frame = picture(thing, *others, T=T, noise=noise)
     (found,) = segment(frame, 1)
-    return frame, found, *observe(frame, found), T
+    return frame, found, *observe(frame, found, CONFIG), T
 
 
 def to_surface(points: np.ndarray, thing: Cylinder) -> np.ndarray:
@@ -73,7 +73,7 @@ def test_a_handle_moves_the_guess_little() -> None:
     T = looking_down(35.0)
     frame = picture(CAN, Cylinder(0.065, 0.0, 0.012, 0.09), T=T)  # a post at the can's side, labelled as one with it
     frame = replace(frame, label=(frame.label > 0).astype(np.int32))
-    _, cube = observe(frame, segment(frame, 1)[0])
+    _, cube = observe(frame, segment(frame, 1)[0], CONFIG)
     foot = cube.to_cube(to_camera(np.zeros(3), T))
     assert np.abs(foot[:2]).max() < 0.06
     assert abs(np.log(CAN.height / BODY_EXTENT / cube.half_extent)) < 0.05
@@ -149,7 +149,7 @@ def test_padding_says_nothing() -> None:
 
 def test_rays_repeat_with_the_seed_and_cover_the_object() -> None:
     frame, found, observation, _, _ = seen(CAN)
-    again, other = observe(frame, found)[0], observe(frame, found, seed=1)[0]
+    again, other = observe(frame, found, CONFIG)[0], observe(frame, found, CONFIG, seed=1)[0]
     np.testing.assert_array_equal(observation.rays.direction, again.rays.direction)
     assert not np.array_equal(observation.rays.direction, other.rays.direction)
     # Evenly spread: each of 4 x 4 cells of equal pixel counts holds about a sixteenth of the rays.
@@ -157,7 +157,7 @@ def test_rays_repeat_with_the_seed_and_cover_the_object() -> None:
     row_edges = np.quantile(pixels[:, 0], [0.25, 0.5, 0.75])
     column_edges = np.quantile(pixels[:, 1], [0.25, 0.5, 0.75])
     rays = np.asarray(observation.rays.direction)[: CONFIG.colour_rays]
-    cube = observe(frame, found)[1]
+    cube = observe(frame, found, CONFIG)[1]
     px = frame.camera.project(rays @ cube.T_camera_object[:3, :3].T)
 
     def cells(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -179,7 +179,7 @@ def test_pixels_without_depth_carry_the_mask_alone() -> None:
     holes = frame.depth.copy()
     holes[::2] = np.nan
     frame = replace(frame, depth=holes)
-    observation, _ = observe(frame, segment(frame, 1)[0])
+    observation, _ = observe(frame, segment(frame, 1)[0], CONFIG)
     objects = np.asarray(observation.status) == OBJECT
     valid = np.asarray(observation.range_valid)
     assert objects.sum() == CONFIG.colour_rays and 60 < valid.sum() < 130
@@ -203,7 +203,7 @@ def test_too_little_depth_is_named() -> None:
     (found,) = segment(frame, 1)
     blank = replace(frame, depth=np.where(found.mask, np.nan, frame.depth))
     with pytest.raises(ValueError, match="object 1 has depth in 0 pixels"):
-        observe(blank, found)
+        observe(blank, found, CONFIG)
 
 
 def centres(cube: ObjectFrame, T: np.ndarray, grid: int = 64) -> np.ndarray:
@@ -244,7 +244,7 @@ def test_nothing_is_seen_without_depth_or_outside_the_picture() -> None:
 def test_the_real_frame(shared_data: Path) -> None:
     frame = read_frame_folder(shared_data / "ycbv_000002")
     (can,) = segment(frame, 1)
-    observation, cube = observe(frame, can)
+    observation, cube = observe(frame, can, CONFIG)
     assert 0.085 < cube.half_extent < 0.105  # a 14 cm can
     assert int((np.asarray(observation.status) == OBJECT).sum()) == CONFIG.colour_rays
     hits = ends(observation, observation.range)[np.asarray(observation.range_valid)]
