@@ -128,6 +128,7 @@ class GridPosterior:
 
     cells: np.ndarray  # f64[c, 3] (yaw in [0, 2 pi), z_0, z_1) of the centres
     probability: np.ndarray  # f64[c], sums to 1
+    log_likelihood: np.ndarray  # f64[c] of the pixels
     log_evidence: float
     evaluations: int
 
@@ -163,11 +164,12 @@ def integrate(
     """
 
     def mass_of(cells: np.ndarray, widths: np.ndarray) -> GridPosterior:
-        log_density = _evaluate(log_likelihood, args, chunk, cells) - 0.5 * np.sum(cells[:, 1:] ** 2, axis=1)
+        value = _evaluate(log_likelihood, args, chunk, cells)
+        log_density = value - 0.5 * np.sum(cells[:, 1:] ** 2, axis=1)
         top = log_density.max()
         mass = np.exp(log_density - top)
         log_evidence = float(top + np.log(mass.sum() * widths.prod()) - 2 * np.log(2 * np.pi))
-        return GridPosterior(cells, mass / mass.sum(), log_evidence, len(cells))
+        return GridPosterior(cells, mass / mass.sum(), value, log_evidence, len(cells))
 
     counts = np.array([36, 6, 24])
     widths = np.array([2 * np.pi, 2 * reach, 2 * reach]) / counts
