@@ -167,9 +167,9 @@ def test_tempered_smc_weighs_modes_that_the_mask_alone_cannot_tell_apart():
 @pytest.mark.parametrize(("condition", "depth"), [("seen", False), ("hidden", False), ("half", True)])
 def test_annealed_hmc_is_the_posterior_but_for_the_chains_that_annealing_left_behind(condition, depth):
     # The paper's schedule on more and shorter trajectories. It is no posterior sampler: a chain that cooled in a worse
-    # mode stays there at full weight. Measured over the six conditions: 4 to 26% of the chains stuck, total variation of
-    # all chains 0.09 to 0.27; of those that reached the likelihood of the posterior 0.03 to 0.13,
-    # no better than 0.1 everywhere: the bound here is what it does, not what a posterior sampler must.
+    # mode stays there at full weight. Measured over the six conditions: 4 to 26% of the chains stuck; total variation
+    # 0.09 to 0.27 of all chains, 0.03 to 0.13 of those that reached the likelihood of the posterior. The bounds here are
+    # what it does, not what a posterior sampler must.
     args, grid = _scene(condition, depth)
     config = AnnealedHMCConfig(chains=256, leapfrog_steps=5, keep=4)
     posterior = annealed_hmc(jax.random.key(0), log_likelihood, args, 7, config)
