@@ -168,7 +168,7 @@ def test_tempered_smc_weighs_modes_that_the_mask_alone_cannot_tell_apart():
 def test_annealed_hmc_is_the_posterior_but_for_the_chains_that_annealing_left_behind(condition, depth):
     # The paper's schedule on more and shorter trajectories. It is no posterior sampler: a chain that cooled in a worse
     # mode stays there at full weight. Measured over the six conditions: 4 to 26% of the chains stuck; total variation
-    # 0.09 to 0.27 of all chains, 0.03 to 0.13 of those that reached the likelihood of the posterior. The bounds here are
+    # 0.09 to 0.27 of all chains, 0.03 to 0.13 of those that reached the likelihood of the posterior. The bounds are
     # what it does, not what a posterior sampler must.
     args, grid = _scene(condition, depth)
     config = AnnealedHMCConfig(chains=256, leapfrog_steps=5, keep=4)
