@@ -11,6 +11,8 @@ from jaxtyping import Array, Bool, Float
 from benchmarks.scene import GRID, HiddenVessel
 from perception.controller import ControllerConfig, crop, estimate
 from perception.observe import observe
+from perception.segment import Segment
+from perception.source import Frame
 from probnerf.baselines.map import MAPConfig, map_estimate
 from probnerf.infer import likelihood_of, opacity_grids
 from probnerf.model import POSE_SIZE, Likelihood, faces_of_view, log_likelihood
@@ -81,6 +83,15 @@ def answers(
     best, _ = map_estimate(model, likelihood, observation, starts, rivals.fit)
     result[MAP] = answer(best[None], np.ones(1), begun)
     return result
+
+
+def warm_up(frame: Frame, segment: Segment, prior: Prior, config: ControllerConfig, sizes: set[int]) -> None:
+    """Compile what this view needs, once for each of the `sizes` it comes in, so that no budget pays for it."""
+    observation, _ = observe(frame, segment, config.observe)
+    size = likelihood_of(config.infer, observation).lattice.crossings
+    if size not in sizes:
+        estimate(frame, segment, prior, config, stages=1)
+        sizes.add(size)
 
 
 def encoder_alone(
