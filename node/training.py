@@ -28,7 +28,7 @@ class Training:
     """Folder of the run: checkpoint, history, curves.png and, in the end, prior.safetensors."""
     preset: Literal["small", "paper", "tiny"] = "small"
     """Sizes of the model: small for two CPU cores, the paper's, or tiny for a trial."""
-    objects: int = 20_000
+    objects: int = 6_000
     """Training objects: the first seeds of the family."""
     pictures: int = 8
     """Pictures of each object."""
