@@ -61,14 +61,14 @@ def count_crossings(rays: Rays, lattice: Lattice) -> int:
     return int(jnp.max(jnp.sum(crossings(rays, lattice) < FAR, axis=-1)))
 
 
-def spacing(t: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """Delta_i: half the gap to the previous crossing plus half the gap to the next (one-sided at the ends)."""
+def gap_before(t: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    """Distance to the previous crossing (the first one: to the next), 0 on padding.
+
+    A ray that ends on face i met the surface somewhere in this gap: face i - 1 was still outside.
+    """
     valid = t < FAR
     gap = jnp.where(valid[:, 1:], t[:, 1:] - t[:, :-1], 0.0)
-    before = jnp.concatenate([gap[:, :1], gap], axis=-1)
-    has_next = jnp.pad(valid[:, 1:], ((0, 0), (0, 1)))
-    after = jnp.where(has_next, jnp.pad(gap, ((0, 0), (0, 1))), before)
-    return jnp.where(valid, 0.5 * (before + after), 0.0)
+    return jnp.where(valid, jnp.concatenate([gap[:, :1], gap], axis=-1), 0.0)
 
 
 def window(points: Float[Array, "... 3"], margin: float = 0.1) -> Float[Array, "..."]:

@@ -134,19 +134,24 @@ def thin(posterior: Posterior, count: int) -> tuple[np.ndarray, np.ndarray, np.n
 def opacity_grids(
     model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "3"], *, grid: int
 ) -> UInt8[Array, "s g g g"]:
-    """round(255 x opacity across a voxel) of each position's shape on [-1, 1]^3 of the view frame."""
-    axis = -1.0 + (jnp.arange(grid) + 0.5) * 2.0 / grid
+    """round(255 x opacity across a voxel) of each position's shape on [-1, 1]^3 of the view frame.
+
+    A voxel's opacity is the largest at its eight corners: like the truth's, it is a wall where it meets the solid.
+    """
+    axis = jnp.linspace(-1.0, 1.0, grid + 1)
     points = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
 
-    def one(position: Float[Array, "d"]) -> UInt8[Array, "v"]:
+    def one(position: Float[Array, "d"]) -> UInt8[Array, "g g g"]:
         weights, pose = split_position(model, likelihood, position, pose_sigma)
         moved, scale = points, jnp.ones(())
         if pose is not None:
             moved, scale = pose.to_object(points), jnp.exp(pose.log_scale)
         sigma = model.field.density(weights, moved) * foam.window(moved)
-        return jnp.round(-255.0 * jnp.expm1(-sigma * scale / grid)).astype(jnp.uint8)
+        corner = jnp.round(-255.0 * jnp.expm1(-sigma * scale / grid)).astype(jnp.uint8)
+        corner = corner.reshape(grid + 1, grid + 1, grid + 1)
+        return jax.lax.reduce_window(corner, jnp.uint8(0), jax.lax.max, (2, 2, 2), (1, 1, 1), "valid")
 
-    return jax.lax.map(one, positions).reshape(-1, grid, grid, grid)
+    return jax.lax.map(one, positions)
 
 
 def poses(model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "3"]) -> Pose:

@@ -127,10 +127,13 @@ def pixel_terms(
 
     # OBJECT: sum_i w_i p(m|hit) p(d|t_i) + T p(m|miss) p(d|miss)
     t_hit, log_w = t[:n_colour], faces.log_weight[:n_colour]
+    # the surface lies in the gap before the face: centred on t_i instead, shapes grow by half a gap
+    gap = foam.gap_before(t_hit)
     deviation = jnp.sqrt(
-        observation.range_sigma[:n_colour, None] ** 2 + likelihood.wall_sigma**2 + foam.spacing(t_hit) ** 2 / 12.0
+        observation.range_sigma[:n_colour, None] ** 2 + likelihood.wall_sigma**2 + gap**2 / 12.0
     )
-    residual = (observation.range[:n_colour, None] - jnp.where(t_hit < foam.FAR, t_hit, 0.0)) / deviation
+    surface = jnp.where(t_hit < foam.FAR, t_hit - 0.5 * gap, 0.0)
+    residual = (observation.range[:n_colour, None] - surface) / deviation
     log_uniform = -jnp.log(likelihood.outlier_span)
     log_depth = jnp.logaddexp(
         jnp.log1p(-likelihood.outlier) - 0.5 * residual**2 - jnp.log(deviation) - 0.5 * jnp.log(2 * jnp.pi),
