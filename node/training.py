@@ -16,6 +16,7 @@ from probnerf import train as training
 from probnerf.families.tabletop import TRAIN_SEEDS
 from probnerf.model import Likelihood
 from probnerf.prior import PRESETS, ProbNeRF
+from probnerf.solids import draw_solids
 from probnerf.store import save_prior
 from probnerf.views import draw_views
 
@@ -28,10 +29,12 @@ class Training:
     """Folder of the run: checkpoint, history, curves.png and, in the end, prior.safetensors."""
     preset: Literal["small", "paper", "tiny"] = "small"
     """Sizes of the model: small for two CPU cores, the paper's, or tiny for a trial."""
-    objects: int = 6_000
+    objects: int = 40_000
     """Training objects: the first seeds of the family."""
+    pictured: int = 4_000
+    """Of these, the first so many are also seen in pictures."""
     pictures: int = 8
-    """Pictures of each object."""
+    """Pictures of each of them."""
     recipe: training.TrainConfig = field(default_factory=training.TrainConfig)
 
 
@@ -43,23 +46,27 @@ def train(options: Training, out: Console, err: Console) -> bool:
     preset, config, folder = PRESETS[options.preset], options.recipe, options.out
     if not 1 <= options.objects <= len(TRAIN_SEEDS):
         raise ValueError(f"--objects is {options.objects}; give 1 to {len(TRAIN_SEEDS)}")
+    if not 1 <= options.pictured <= options.objects:
+        raise ValueError(f"--pictured is {options.pictured}; give 1 to {options.objects}, the number of objects")
     history, curves, weights = folder / "history.jsonl", folder / "curves.png", folder / "prior.safetensors"
     likelihood = Likelihood(lattice=foam.Lattice(preset.lattice, 1.0, 9 * preset.lattice // 4))
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     state = None
     try:
         with Progress(*columns, TimeRemainingColumn(), console=err, disable=not err.is_terminal) as progress:
-            drawing = progress.add_task("pictures", total=options.objects)
+            sampling = progress.add_task("objects", total=options.objects)
             seeds = np.asarray(TRAIN_SEEDS[: options.objects])
+            solids = draw_solids(seeds, progress=lambda done, total: progress.update(sampling, completed=done))
+            drawing = progress.add_task("pictures", total=options.pictured)
             views = draw_views(
-                seeds,
+                seeds[: options.pictured],
                 options.pictures,
                 preset.image_size,
                 progress=lambda done, total: progress.update(drawing, completed=done),
             )
             steps = progress.add_task("steps", total=config.steps)
             model = ProbNeRF(preset, np.array([0, config.seed], np.uint32))  # type: ignore[arg-type]  # a raw key
-            for state, metrics in training.train(model, views, likelihood, config, folder):  # noqa: B007
+            for state, metrics in training.train(model, solids, views, likelihood, config, folder):  # noqa: B007
                 text = "steps  " + "  ".join(f"{k} {v:.4g}" for k, v in metrics.items() if k != "step")
                 progress.update(steps, completed=int(metrics["step"]), description=text)
     except KeyboardInterrupt:
@@ -75,13 +82,14 @@ def train(options: Training, out: Console, err: Console) -> bool:
     story = {
         "family": "tabletop",
         "seeds": [TRAIN_SEEDS.start, TRAIN_SEEDS.start + options.objects],
+        "pictured": options.pictured,
         "pictures": options.pictures,
         "recipe": asdict(config),
         "steps": int(state.step),
         "revision": _revision(),
         "gate": None,
     }
-    save_prior(weights, state.average, story)
+    save_prior(weights, state.model, story)
     out.print(f"{weights}; judge it with `farside bench prior --prior {weights}`", highlight=False, soft_wrap=True)
     return True
 

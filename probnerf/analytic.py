@@ -1,7 +1,7 @@
 """Scenes of the analytic field, and their posterior by brute force: a right answer with no training and no sampling.
 
 Pixels are drawn from the very density that `model.pixel_terms` evaluates, so the posterior is well-posed; x, y and
-log-scale are known (pose_sigma = 0), which leaves yaw, handle length and radius to a grid.
+log-scale are known and ranges unbiased (pose_sigma = 0), which leaves yaw, handle length and radius to a grid.
 """
 
 from collections.abc import Callable
@@ -61,7 +61,7 @@ def draw_pixels(
     """
     n = rays.origin.shape[0]
     keys = jax.random.split(key, 6)
-    pose_sigma = jnp.zeros(3)
+    pose_sigma = jnp.zeros(4)
     weights, pose = split_position(model, likelihood, position, pose_sigma)
     picture = foam.render(model.field, weights, rays, likelihood.lattice, pose)
     end = jax.random.categorical(
@@ -71,8 +71,10 @@ def draw_pixels(
     face = jnp.minimum(end, picture.t.shape[1] - 1)[:, None]
     is_object = known & (hit ^ jax.random.bernoulli(keys[1], likelihood.mask_error, (n,)))
 
-    deviation = jnp.sqrt(range_sigma**2 + likelihood.wall_sigma**2 + foam.spacing(picture.t) ** 2 / 12.0)
-    wall = jnp.take_along_axis(picture.t + deviation * jax.random.normal(keys[2], picture.t.shape), face, axis=1)[:, 0]
+    gap = foam.gap_before(picture.t)
+    deviation = jnp.sqrt(range_sigma**2 + likelihood.wall_sigma**2 + gap**2 / 12.0)
+    surface = picture.t - 0.5 * gap
+    wall = jnp.take_along_axis(surface + deviation * jax.random.normal(keys[2], surface.shape), face, axis=1)[:, 0]
     middle = jnp.linalg.norm(rays.origin, axis=1)
     nowhere = middle + likelihood.outlier_span * jax.random.uniform(keys[3], (n,), minval=-0.5, maxval=0.5)
     astray = ~hit | jax.random.bernoulli(keys[4], likelihood.outlier, (n,))
@@ -113,7 +115,7 @@ def scene(condition: str, depth: bool, seed: int = 0, columns: int = 12, rows: i
     bare = foam.Lattice(cubes)
     likelihood = Likelihood(foam.Lattice(cubes, max_crossings=foam.count_crossings(rays, bare)))
     yaw = np.deg2rad(YAW_OF[condition])
-    position = jnp.array([0.3, 0.1, np.cos(yaw), np.sin(yaw), 0.0, 0.0, 0.0], jnp.float32)
+    position = jnp.array([0.3, 0.1, np.cos(yaw), np.sin(yaw), 0.0, 0.0, 0.0, 0.0], jnp.float32)
     known = jnp.arange(columns * rows) >= (columns // 2 * rows if condition == "half" else 0)
     model = CylinderModel()
     key = jax.random.key(seed)
@@ -196,7 +198,7 @@ def integrate(
 def _evaluate(log_likelihood: Callable, args: Any, chunk: int, cells: np.ndarray) -> np.ndarray:
     """Log-likelihood of each cell's centre, `chunk` at a time."""
     yaw, z = cells[:, :1], cells[:, 1:]
-    positions = np.concatenate([z, np.cos(yaw), np.sin(yaw), np.zeros((len(cells), 3))], axis=1).astype(np.float32)
+    positions = np.concatenate([z, np.cos(yaw), np.sin(yaw), np.zeros((len(cells), 4))], axis=1).astype(np.float32)
     padded = np.pad(positions, ((0, -len(cells) % chunk), (0, 0)), mode="edge").reshape(-1, chunk, positions.shape[1])
     parts = [np.asarray(_compiled(log_likelihood, args, part)) for part in padded]
     return np.concatenate(parts)[: len(cells)].astype(np.float64)

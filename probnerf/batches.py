@@ -1,15 +1,12 @@
-"""Training batches: which objects, views, pixels and solid samples a step sees: a function of (seed, step) alone."""
+"""Batches of training's second phase: which objects, views and pixels a step sees, a function of (seed, step) alone."""
 
 from typing import Protocol
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 from scipy import ndimage
 
-from probnerf.families.tabletop import TabletopObject
 from probnerf.views import ViewSet
 
 
@@ -34,7 +31,7 @@ Data = Array | np.ndarray  # drawn on the host, used on the device
 class Batch(eqx.Module):
     """One step's data, all arrays with a leading object axis."""
 
-    objects: TabletopObject
+    rows: Data  # i32 [b], which objects
     rgb: Data  # u8 [b, j, s, s, 3]
     distance: Data  # f32 [b, j, s, s]
     unknown: Data  # bool [b, j, s, s]
@@ -67,9 +64,7 @@ def strata_of(views: ViewSet) -> Strata:
     return Strata(order, (stratum == 0).sum(1).astype(np.int32), (stratum <= 1).sum(1).astype(np.int32))
 
 
-def draw_batch(
-    views: ViewSet, objects: TabletopObject, strata: Strata, config: BatchConfig, step: int, size: int
-) -> Batch:
+def draw_batch(views: ViewSet, strata: Strata, config: BatchConfig, step: int, size: int) -> Batch:
     """The batch of one step: a function of (seed, step) alone, so that a resumed run repeats the lost one."""
     rng = np.random.default_rng([config.seed, step, 3])
     chosen = rng.choice(len(views.seeds), size, replace=False)
@@ -112,7 +107,7 @@ def draw_batch(
         axis=-1,
     )
     return Batch(
-        objects=jax.tree.map(lambda a: a[chosen], objects),
+        rows=chosen.astype(np.int32),
         rgb=views.rgb[rows, view],
         distance=views.range[rows, view],
         unknown=unknown,
@@ -135,40 +130,3 @@ def _half_planes(rng: np.random.Generator, b: int, j: int, s: int) -> np.ndarray
     offset = rng.uniform(-0.2, 0.35, (b, j, 1, 1))
     hidden = np.cos(angle) * x + np.sin(angle) * y > offset
     return hidden & (rng.random((b, j, 1, 1)) < 0.25)
-
-
-def solid_points(batch: Batch, key: Array, count: int) -> Float[Array, "b p 3"]:
-    """Where solid samples are taken: half near visible surfaces, a quarter around the handle, the rest uniform.
-
-    A handle is a hundredth of the cube: without samples of its own a decoder learns it last. Objects without one get
-    uniform samples instead.
-    """
-    near, handle = count // 2, count // 4
-    keys = jax.random.split(key, 6)
-    b, n = batch.ray_range.shape
-    surface = batch.origin + batch.ray_range[..., None] * batch.direction
-    index = jax.random.randint(keys[0], (b, near), 0, n)
-    hit = jnp.take_along_axis(batch.ray_range, index, axis=1) > 0
-    near_points = jnp.take_along_axis(surface, index[..., None], axis=1) + 0.05 * jax.random.normal(
-        keys[1], (b, near, 3)
-    )
-    uniform = jax.random.uniform(keys[2], (b, count, 3), minval=-1.0, maxval=1.0)
-
-    # along the handle's centre line, which lies in the plane y = 0
-    last = batch.objects.tube.shape[1] - 1
-    u = last * jax.random.uniform(keys[3], (b, handle))
-    low = jnp.minimum(u.astype(jnp.int32), last - 1)
-    start = jnp.take_along_axis(batch.objects.tube, low[..., None], axis=1)
-    end = jnp.take_along_axis(batch.objects.tube, low[..., None] + 1, axis=1)
-    line = start + (u - low)[..., None] * (end - start)
-    line = jnp.stack([line[..., 0], jnp.zeros_like(u), line[..., 1]], axis=-1)
-    around = line + 0.1 * jax.random.normal(keys[4], line.shape)
-
-    return jnp.concatenate(
-        [
-            jnp.where(hit[..., None], near_points, uniform[:, :near]),
-            jnp.where(batch.objects.has_handle[:, None, None], around, uniform[:, near : near + handle]),
-            uniform[:, near + handle :],
-        ],
-        axis=1,
-    )

@@ -97,6 +97,9 @@ def with_radius(x: Float[Array, "3 n"]) -> Float[Array, "4 n"]:
     return jnp.concatenate([x, jnp.sqrt(x[:1] ** 2 + x[1:2] ** 2 + 1e-4)], axis=0)
 
 
+STRETCH, SHIFT = 0.3, 0.1  # natural sizes of the fitted field's log-stretch and shift (cube units)
+
+
 def _octave_scale(octaves: int, channels: int) -> np.ndarray:
     return np.concatenate([np.ones(channels), np.repeat(2.0 ** (-0.75 * np.arange(octaves)), 2 * channels)])
 
@@ -112,14 +115,16 @@ class MLPField(eqx.Module):
     direction_octaves: int = eqx.field(static=True, default=10)
     density_scale: float = eqx.field(static=True, default=64.0)  # sigma = density_scale * softplus(output)
     radial: bool = eqx.field(static=True, default=False)  # also encode the distance from the axis (not in the paper)
+    fitted: bool = eqx.field(static=True, default=False)  # the last six weights stretch and shift the points (nor this)
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:
-        """Kernel and bias shapes in the order of the flat vector: density MLP, then colour MLP."""
+        """Kernel and bias shapes in the order of the flat vector: density MLP, colour MLP; log-stretch and shift."""
         position, direction = encoded_size(self.octaves, 3 + self.radial), encoded_size(self.direction_octaves)
         h = self.width
         layers = [(position, h), (h, h), (h, 1), (position + direction + 1, h), (h, h), (h, 3)]
-        return [shape for kernel in layers for shape in (kernel, kernel[1:])]
+        shapes: list[tuple[int, ...]] = [shape for kernel in layers for shape in (kernel, kernel[1:])]
+        return shapes + [(3,), (3,)] * self.fitted
 
     @property
     def size(self) -> int:
@@ -140,10 +145,12 @@ class MLPField(eqx.Module):
         for index, rows in ((0, [place]), (6, [place, view])):
             rest = np.ones(scale[index].shape[0] - sum(map(len, rows)))
             scale[index] *= np.concatenate([*rows, rest])[:, None]
+        if self.fitted:
+            scale[12:] = [np.full(3, STRETCH), np.full(3, SHIFT)]
         return np.concatenate([part.ravel() for part in scale]).astype(np.float32)
 
     def unpack(self, weights: Float[Array, "d"]) -> list[Array]:
-        """The flat vector as twelve arrays."""
+        """The flat vector as twelve arrays, and two more where the field is fitted."""
         parts, start = [], 0
         for shape in self.shapes:
             end = start + math.prod(shape)
@@ -151,14 +158,21 @@ class MLPField(eqx.Module):
             start = end
         return parts
 
-    def _place(self, points: Float[Array, "... 3"]) -> Float[Array, "e n"]:
+    def _place(self, parts: list[Array], points: Float[Array, "... 3"]) -> Float[Array, "e n"]:
+        """Encoded points. A fitted field first undoes the object's own stretch and shift about its support point:
+        sizes and slack are then six numbers, not a change of every weight.
+        """
         x = _columns(points)
+        if self.fitted:
+            stretch, shift = parts[12:]
+            base = jnp.array([[0.0], [0.0], [BASE_Z]])
+            x = (x - base - shift[:, None]) * jnp.exp(stretch)[:, None] + base
         return encode(with_radius(x) if self.radial else x, self.octaves)
 
     def density(self, weights: Float[Array, "d"], points: Float[Array, "... 3"]) -> Float[Array, "..."]:
         """sigma = density_scale * softplus(MLP(encode(x)))."""
-        k0, b0, k1, b1, k2, b2, *_ = self.unpack(weights)
-        output = _mlp(self._place(points), k0, b0, k1, b1, k2, b2)
+        parts = self.unpack(weights)
+        output = _mlp(self._place(parts, points), *parts[:6])
         return self.density_scale * jax.nn.softplus(output[0]).reshape(points.shape[:-1])
 
     def colour(
@@ -169,10 +183,10 @@ class MLPField(eqx.Module):
         sigma: Float[Array, "..."],
     ) -> Float[Array, "... 3"]:
         """RGB from encode(x), encode(v) and log(1 + sigma) (its logarithm: sigma spans 0 to thousands)."""
-        *_, k0, b0, k1, b1, k2, b2 = self.unpack(weights)
+        parts = self.unpack(weights)
         seen = encode(_columns(directions), self.direction_octaves)
-        inputs = [self._place(points), seen, jnp.log1p(sigma).reshape(1, -1)]
-        output = _mlp(jnp.concatenate(inputs, axis=0), k0, b0, k1, b1, k2, b2)
+        inputs = [self._place(parts, points), seen, jnp.log1p(sigma).reshape(1, -1)]
+        output = _mlp(jnp.concatenate(inputs, axis=0), *parts[6:12])
         return jax.nn.sigmoid(output).T.reshape(points.shape)
 
 

@@ -13,7 +13,16 @@ from jaxtyping import Array, Float, UInt8
 
 from probnerf import foam
 from probnerf.hmc import AnnealedHMCConfig, StageInfo, annealed_hmc
-from probnerf.model import Likelihood, Model, faces_of_view, log_likelihood, pose_of, split_position
+from probnerf.model import (
+    POSE_SIZE,
+    Likelihood,
+    Model,
+    faces_of_view,
+    log_likelihood,
+    pose_of,
+    range_offset_of,
+    split_position,
+)
 from probnerf.prior import ProbNeRF
 from probnerf.proposal import Picture, propose
 from probnerf.smc import TemperedSMCConfig, tempered_smc
@@ -132,7 +141,7 @@ def thin(posterior: Posterior, count: int) -> tuple[np.ndarray, np.ndarray, np.n
 
 @partial(jax.jit, static_argnames=("grid",))
 def opacity_grids(
-    model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "3"], *, grid: int
+    model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "4"], *, grid: int
 ) -> UInt8[Array, "s g g g"]:
     """round(255 x opacity across a voxel) of each position's shape on [-1, 1]^3 of the view frame.
 
@@ -154,13 +163,13 @@ def opacity_grids(
     return jax.lax.map(one, positions)
 
 
-def poses(model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "3"]) -> Pose:
+def poses(model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "4"]) -> Pose:
     """Pose of each position (identity where the pose was known)."""
     if not likelihood.sample_pose:
         zeros = jnp.zeros(positions.shape[0])
         return Pose(zeros, zeros, zeros, zeros)
     k = model.latent
-    return pose_of(positions[:, k : k + 5], pose_sigma)
+    return pose_of(positions[:, k : k + POSE_SIZE], pose_sigma)
 
 
 @jax.jit
@@ -185,7 +194,8 @@ def explained(
         w = jnp.exp(faces.log_weight)
         hit = -jnp.expm1(faces.log_transmittance[:, -1])
         tolerance = jnp.maximum(3.0 * jnp.sqrt(observation.range_sigma**2 + likelihood.wall_sigma**2), 0.06)
-        close = jnp.abs(t - observation.range[:, None]) <= tolerance[:, None]
+        offset = range_offset_of(model, likelihood, position, observation.pose_sigma)
+        close = jnp.abs(t - (observation.range - offset)[:, None]) <= tolerance[:, None]
         at_range = jnp.sum(jnp.where(close, w, 0.0), axis=-1)
         before = jnp.sum(jnp.where(t <= observation.limit[:, None], w, 0.0), axis=-1)
         good = jnp.where(

@@ -1,7 +1,8 @@
 """log p(observation | position): what camera pixels say, and the position vector that samplers move.
 
-A position is a flat vector [z~ (K) | a, b, x, y, log-scale (5, if the pose is unknown) | delta (D, if open)], each
-entry a priori N(0, 1), so the log prior is the same standard normal for every model and tempering is one multiply.
+A position is a flat vector [z~ (K) | a, b, x, y, log-scale, range offset (6, if the pose is unknown) | delta (D, if
+open)], each entry a priori N(0, 1), so the log prior is the same standard normal for every model and tempering is one
+multiply.
 """
 
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from probnerf import foam
 from probnerf.field import CylinderField, Field
 from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
 
-POSE_SIZE = 5
+POSE_SIZE = 6
 
 
 class Model(Protocol):
@@ -65,7 +66,7 @@ class Likelihood(eqx.Module):
         return model.latent + POSE_SIZE * self.sample_pose + weights
 
 
-def pose_of(latent: Float[Array, "5"], pose_sigma: Float[Array, "3"]) -> Pose:
+def pose_of(latent: Float[Array, "6"], pose_sigma: Float[Array, "4"]) -> Pose:
     """yaw = atan2(b, a); x, y, log-scale are standard normals times perception's widths."""
     a, b = latent[..., 0], latent[..., 1]
     # atan2 has no gradient at the origin, a point of measure zero that float32 could still meet
@@ -75,8 +76,18 @@ def pose_of(latent: Float[Array, "5"], pose_sigma: Float[Array, "3"]) -> Pose:
     return Pose(yaw=yaw, x=x, y=y, log_scale=log_scale)
 
 
+def range_offset_of(
+    model: Model, likelihood: Likelihood, position: Float[Array, "d"], pose_sigma: Float[Array, "4"]
+) -> Float[Array, ""]:
+    """What all ranges of a view have in common, cube units: a depth camera's bias, which no number of pixels averages.
+
+    Without it the many pixels would place a hidden back wall confidently where the bias puts it.
+    """
+    return position[model.latent + POSE_SIZE - 1] * pose_sigma[3] if likelihood.sample_pose else jnp.zeros(())
+
+
 def split_position(
-    model: Model, likelihood: Likelihood, position: Float[Array, "d"], pose_sigma: Float[Array, "3"]
+    model: Model, likelihood: Likelihood, position: Float[Array, "d"], pose_sigma: Float[Array, "4"]
 ) -> tuple[Float[Array, "w"], Pose | None]:
     """Field weights w~ and pose of one position."""
     k = model.latent
@@ -103,7 +114,8 @@ def log_likelihood_one(
 ) -> Float[Array, ""]:
     """log p(observation | one position), summed over pixels."""
     weights, pose = split_position(model, likelihood, position, observation.pose_sigma)
-    return likelihood.power * jnp.sum(pixel_terms(model.field, weights, pose, likelihood, observation, t))
+    offset = range_offset_of(model, likelihood, position, observation.pose_sigma)
+    return likelihood.power * jnp.sum(pixel_terms(model.field, weights, pose, likelihood, observation, t, offset))
 
 
 def pixel_terms(
@@ -113,6 +125,7 @@ def pixel_terms(
     likelihood: Likelihood,
     observation: Observation,
     t: Float[Array, "n m"],
+    range_offset: Float[Array, ""] | float = 0.0,
 ) -> Float[Array, "n"]:
     """Each pixel's log density: where its ray ends, is it the object, how far, which colour."""
     n_colour = observation.colour_count
@@ -129,17 +142,16 @@ def pixel_terms(
     t_hit, log_w = t[:n_colour], faces.log_weight[:n_colour]
     # the surface lies in the gap before the face: centred on t_i instead, shapes grow by half a gap
     gap = foam.gap_before(t_hit)
-    deviation = jnp.sqrt(
-        observation.range_sigma[:n_colour, None] ** 2 + likelihood.wall_sigma**2 + gap**2 / 12.0
-    )
+    deviation = jnp.sqrt(observation.range_sigma[:n_colour, None] ** 2 + likelihood.wall_sigma**2 + gap**2 / 12.0)
     surface = jnp.where(t_hit < foam.FAR, t_hit - 0.5 * gap, 0.0)
-    residual = (observation.range[:n_colour, None] - surface) / deviation
+    valid = observation.range_valid[:n_colour]
+    measured = jnp.where(valid, observation.range[:n_colour], 0.0) - range_offset  # no NaN may reach the gradient
+    residual = (measured[:, None] - surface) / deviation
     log_uniform = -jnp.log(likelihood.outlier_span)
     log_depth = jnp.logaddexp(
         jnp.log1p(-likelihood.outlier) - 0.5 * residual**2 - jnp.log(deviation) - 0.5 * jnp.log(2 * jnp.pi),
         jnp.log(likelihood.outlier) + log_uniform,
     )
-    valid = observation.range_valid[:n_colour]
     log_hit = jax.nn.logsumexp(log_w + jnp.where(valid[:, None], log_depth, 0.0), axis=-1) + jnp.log1p(-eps)
     log_not = log_miss[:n_colour] + jnp.log(eps) + jnp.where(valid, log_uniform, 0.0)
     as_object = jnp.logaddexp(log_hit, log_not)

@@ -35,12 +35,18 @@ class Preset:
     image_size: int  # encoder input, pixels
     encoder_channels: tuple[int, ...]
     radial: bool = False  # the field also sees the distance from the body's axis
+    fitted: bool = False  # the field's first map stretches and shifts the points
+    smooth: bool = False  # SiLU in the hypernetwork, where the paper has ReLU
 
     @property
     def field(self) -> MLPField:
         """The field whose weights the hypernetwork makes."""
         return MLPField(
-            width=self.width, octaves=self.octaves, direction_octaves=self.direction_octaves, radial=self.radial
+            width=self.width,
+            octaves=self.octaves,
+            direction_octaves=self.direction_octaves,
+            radial=self.radial,
+            fitted=self.fitted,
         )
 
 
@@ -48,7 +54,7 @@ PRESETS = {
     preset.name: preset
     for preset in (
         Preset("paper", 128, 64, 10, 10, 512, 512, 128, 128, (32, 64, 128, 128, 128)),
-        Preset("small", 48, 48, 6, 1, 128, 256, 32, 32, (24, 32, 48, 64, 128), radial=True),
+        Preset("small", 48, 48, 6, 1, 128, 256, 32, 32, (24, 32, 48, 64, 128), radial=True, fitted=True, smooth=True),
         Preset("tiny", 4, 8, 2, 1, 16, 16, 8, 16, (4, 4, 4, 4, 4)),  # for tests
     )
 }
@@ -161,8 +167,10 @@ class HyperNetwork(eqx.Module):
     weight: Float[Array, "d h"]
     bias: Float[Array, "d"]
     scale: Float[Array, "d"]  # each weight's natural size (`MLPField.weight_scale`): outputs start as a fresh MLP's
+    smooth: bool = eqx.field(static=True)
 
-    def __init__(self, latent: int, hidden: int, field: MLPField, key: PRNGKeyArray):
+    def __init__(self, latent: int, hidden: int, field: MLPField, smooth: bool, key: PRNGKeyArray):
+        self.smooth = smooth
         k0, k1, k2, k3 = jax.random.split(key, 4)
         self.hidden0 = relu_layer(eqx.nn.Linear(latent, hidden, key=k0))
         self.hidden1 = relu_layer(eqx.nn.Linear(hidden, hidden, key=k1))
@@ -172,8 +180,8 @@ class HyperNetwork(eqx.Module):
         self.weight = 0.5 * jax.random.normal(k2, (field.size, hidden))
 
     def __call__(self, z: Float[Array, "k"]) -> Float[Array, "d"]:
-        h = jax.nn.relu(self.hidden0(z))
-        h = jax.nn.relu(self.hidden1(h))
+        activation = jax.nn.silu if self.smooth else jax.nn.relu
+        h = activation(self.hidden1(activation(self.hidden0(z))))
         # dividing here, not in the weights, keeps Adam's steps in w as small as the bias's
         return jax.lax.stop_gradient(self.scale) * (self.weight @ h / math.sqrt(h.shape[0]) + self.bias)
 
@@ -262,7 +270,7 @@ class ProbNeRF(eqx.Module):
         k0, k1, k2 = jax.random.split(key, 3)
         self.preset = preset
         self.flow = RealNVP(preset.latent, preset.flow_hidden, k0)
-        self.hyper = HyperNetwork(preset.latent, preset.hyper_hidden, preset.field, k1)
+        self.hyper = HyperNetwork(preset.latent, preset.hyper_hidden, preset.field, preset.smooth, k1)
         self.encoder = Encoder(preset, k2)
 
     @property

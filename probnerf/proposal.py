@@ -55,7 +55,7 @@ def propose(
     model: ProbNeRF,
     likelihood: Likelihood,
     picture: Picture,
-    pose_sigma: Float[Array, "3"],
+    pose_sigma: Float[Array, "4"],
     populations: int,
     count: int,
     prior_share: float = 0.25,

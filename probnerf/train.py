@@ -1,14 +1,15 @@
-"""ELBO training of a prior (paper §2.2): views and solid samples of procedural objects in, ProbNeRF weights out.
+"""ELBO training of a prior (paper §2.2): procedural objects in, ProbNeRF weights out. Two phases.
 
-An object's data are (a) pixels of its views, through the same joint pixel likelihood that inference uses, on a lattice
-that is turned, shifted and scaled at random, and (b) solid samples: is a face at this point opaque? They
-cost a tenth of a ray, so the first steps use them alone. Both are observations, the objective is an ELBO throughout:
-N_rays E[log p] + N_points E[log p] - weight KL. Pixels are drawn by strata (object, near it, elsewhere) and weighted by
-each stratum's size, so that the pixel term is an unbiased estimate of its mean over all pixels.
+Solid phase: what is solid and what colour surfaces have (`solids`), observed at points. It needs no picture and costs
+a tenth of rays; it makes the decoder. Ray phase: pixels of views as well, through the same joint pixel likelihood that
+inference uses, on a lattice that is turned, shifted and scaled at random; and the picture encoder. All are
+observations, the objective is an ELBO throughout: N_points E[log p] + N_colours E[log p] + N_rays E[log p] - weight KL.
+Pixels are drawn by strata (object, near it, elsewhere) and weighted by each stratum's size, so that the pixel term is
+an unbiased estimate of its mean over all pixels.
 
 Unlike the paper's, q(z) is not read off pictures: `Recognition` is told the object's exact description, and the decoder
-learns several times faster. The picture encoder learns beside it to cover the recognised z (forward KL), so that what a
-view leaves open stays open in its answer.
+learns several times faster. The picture encoder learns to cover the recognised z (forward KL), so that what a view
+leaves open stays open in its answer.
 """
 
 import json
@@ -27,10 +28,11 @@ import optax
 from jaxtyping import Array, Float
 
 from probnerf import foam
-from probnerf.batches import Batch, draw_batch, solid_points, strata_of
-from probnerf.families.tabletop import description, sample_object, sample_objects, signed_distance
+from probnerf.batches import Batch, draw_batch, strata_of
+from probnerf.families.tabletop import description, sample_object
 from probnerf.model import Likelihood, map_with_gradient, pixel_terms
 from probnerf.prior import ProbNeRF, Recognition
+from probnerf.solids import Solids, colour_samples, shape_samples
 from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
 from probnerf.views import ViewSet, camera_features, encoder_image
 
@@ -39,23 +41,26 @@ from probnerf.views import ViewSet, camera_features, encoder_image
 class TrainConfig:
     """The recipe. Steps count optimiser updates; every number travels with the weights."""
 
-    steps: int = 25_000
-    solid_steps: int = 23_000  # of these, the first so many use solid samples alone
-    batch: int = 32  # objects per step in the solid phase
-    ray_batch: int = 8  # objects per step afterwards
-    encode_objects: int = 8  # of a batch, those whose views the encoder sees
+    steps: int = 60_000
+    solid_steps: int = 55_000  # of these, the first so many are the solid phase
+    batch: int = 64  # objects per step in the solid phase
+    ray_batch: int = 16  # objects per step afterwards
     views: int = 3  # encoder views per object; a random number of them is used
-    object_rays: int = 96
-    near_rays: int = 48  # free pixels within 2 pixels of the object
-    far_rays: int = 16
-    points: int = 1024  # solid samples per object (see `solid_points`)
+    object_rays: int = 48
+    near_rays: int = 24  # free pixels within 2 pixels of the object
+    far_rays: int = 8
+    points: int = 512  # solid samples per object
+    colours: int = 192  # surface colours per object
+    finer: float = 2.0  # solid samples are opaque on a lattice finer by this
+    grazing: float = 4.0  # empty ones transparent to a ray that meets so many faces there
     effective_rays: float = 1500.0  # N_rays: independent residuals per object
-    effective_points: float = 3000.0  # N_points
+    effective_points: float = 10_000.0  # N_points
+    effective_colours: float = 800.0  # N_colours
     learning_rate: float = 2e-3
+    ray_learning_rate: float = 3e-4  # of all but the encoder, in the ray phase
     final_learning_rate: float = 2e-5
     warmup: int = 500
-    kl_warmup: int = 8_000
-    average: float = 0.999  # decay of the averaged weights, which are what is shipped
+    kl_warmup: int = 2_000
     seed: int = 0
     checkpoint_every: int = 500
     log_every: int = 50
@@ -81,70 +86,64 @@ def kl_estimate(model: ProbNeRF, z: Array, mean: Array, precision: Array) -> Flo
     return log_q - (log_det - 0.5 * jnp.sum(z_tilde**2))
 
 
-def encoder_loss(model: ProbNeRF, batch: Batch, z: Float[Array, "b k"], objects: int) -> Float[Array, ""]:
+def encoder_loss(model: ProbNeRF, batch: Batch, z: Float[Array, "b k"]) -> Float[Array, ""]:
     """-log q(z | views) of the recognised z: the encoder learns to cover what views leave open, not to pick a mode."""
-    few = jax.tree.map(lambda a: a[:objects], batch)
-    mean, precision = encode(model, few)
-    z = jax.lax.stop_gradient(z[:objects])
+    mean, precision = encode(model, batch)
+    z = jax.lax.stop_gradient(z)
     return -0.5 * jnp.mean(jnp.sum(jnp.log(precision) - precision * (z - mean) ** 2, axis=-1))
 
 
-class _PerObject(eqx.Module):
-    """What the field terms of one object need."""
+def _solid_terms(shared: tuple, item: tuple, weights: Array) -> Float[Array, ""]:
+    """Mean log-likelihood of solid samples and of surface colours, each times its count."""
+    field, likelihood, config = shared
+    points, inside, place, view, rgb, valid = item
+    tau = field.density(weights, points) * foam.window(points) / likelihood.lattice.cubes
+    # a grazing ray meets several faces outside, a finer lattice has thinner ones inside: both sharpen the wall
+    probability = jnp.where(inside, -jnp.expm1(-tau / config.finer), jnp.exp(-config.grazing * tau))
+    eps = likelihood.mask_error
+    solid = jnp.mean(jnp.log(eps + (1.0 - 2.0 * eps) * probability))
+    sigma = jax.lax.stop_gradient(field.density(weights, place))
+    squared = jnp.sum((field.colour(weights, place, view, sigma) - rgb) ** 2, axis=-1)
+    counted = jnp.sum(jnp.where(valid, squared, 0.0)) / jnp.maximum(jnp.sum(valid), 1)
+    colour = -0.5 * counted / likelihood.colour_sigma**2
+    return config.effective_points * solid + config.effective_colours * colour
 
-    points: Array
-    solid: Array
+
+class _ObjectRays(eqx.Module):
+    """One object's rays."""
+
     origin: Array
     direction: Array
-    ray_rgb: Array
-    ray_range: Array
-    ray_weight: Array
+    rgb: Array
+    range: Array
+    weight: Array
     turn: Array
 
 
-def _solid_terms(shared: tuple, item: _PerObject, weights: Array) -> Float[Array, ""]:
-    """Mean log-likelihood of solid samples and of surface colours (first phase)."""
-    model_field, likelihood, config, colour_weight = shared
-    tau = model_field.density(weights, item.points) / likelihood.lattice.cubes
-    opaque = -jnp.expm1(-tau)
-    eps = likelihood.mask_error
-    probability = jnp.where(item.solid, opaque, 1.0 - opaque)
-    solid = jnp.mean(jnp.log(eps + (1.0 - 2.0 * eps) * probability))
-    if not colour_weight:
-        return config.effective_points * solid
-    n = config.object_rays
-    surface = item.origin[:n] + (item.ray_range[:n, None] + 0.01) * item.direction[:n]
-    sigma = jax.lax.stop_gradient(model_field.density(weights, surface))
-    rgb = model_field.colour(weights, surface, item.direction[:n], sigma)
-    colour = -0.5 * jnp.mean(jnp.sum((rgb - item.ray_rgb[:n]) ** 2, -1)) / likelihood.colour_sigma**2
-    return config.effective_points * solid + config.effective_rays * colour_weight * colour
-
-
-def _ray_terms(shared: tuple, item: _PerObject, weights: Array) -> Float[Array, ""]:
-    """Weighted mean of the joint pixel log-likelihood over a lattice that is turned, shifted and scaled."""
-    model_field, likelihood, config, _ = shared
-    pose = Pose(yaw=item.turn[0], x=item.turn[1], y=item.turn[2], log_scale=item.turn[3])
+def _ray_terms(shared: tuple, item: tuple[_ObjectRays, tuple], weights: Array) -> Float[Array, ""]:
+    """Weighted mean of the joint pixel log-likelihood over a lattice that is turned, shifted and scaled; and solids."""
+    field, likelihood, config = shared
+    seen, solids = item
+    pose = Pose(yaw=seen.turn[0], x=seen.turn[1], y=seen.turn[2], log_scale=seen.turn[3])
     scale = jnp.exp(pose.log_scale)
-    rays = Rays(origin=_to_view(pose, item.origin), direction=_turn(pose, item.direction))
+    rays = Rays(origin=_to_view(pose, seen.origin), direction=_turn(pose, seen.direction))
     n = config.object_rays
-    count = item.ray_range.shape[0]
+    count = seen.range.shape[0]
     observation = Observation(
         rays=rays,
         status=jnp.where(jnp.arange(count) < n, OBJECT, FREE),
-        rgb=item.ray_rgb,
+        rgb=seen.rgb,
         rgb_valid=jnp.ones(count, bool),
-        range=item.ray_range * scale,
+        range=seen.range * scale,
         range_sigma=jnp.full((count,), 0.01),
-        range_valid=item.ray_range > 0,
+        range_valid=seen.range > 0,
         limit=jnp.full((count,), 0.5 * foam.FAR),
-        pose_sigma=jnp.zeros(3),
+        pose_sigma=jnp.zeros(4),
         colour_count=n,
     )
     t = foam.crossings(rays, likelihood.lattice)
-    terms = pixel_terms(model_field, weights, pose, likelihood, observation, t)
-    return config.effective_rays * jnp.sum(item.ray_weight * terms) + _solid_terms(
-        (model_field, likelihood, config, 0.0), item, weights
-    )
+    terms = pixel_terms(field, weights, pose, likelihood, observation, t)
+    return config.effective_rays * jnp.sum(seen.weight * terms) + _solid_terms(shared, solids, weights)
 
 
 def _turn(pose: Pose, d: Array) -> Array:
@@ -160,29 +159,28 @@ def _to_view(pose: Pose, p: Array) -> Array:
 
 def loss(
     networks: tuple[ProbNeRF, Recognition],
-    batch: Batch,
+    solids: Solids,
+    batch: Batch | None,
     key: Array,
     kl_weight: Array,
     likelihood: Likelihood,
     config: TrainConfig,
-    rays: bool,
 ) -> tuple[Array, dict[str, Array]]:
-    """Negative ELBO per object, with q(z) by recognition, plus the picture encoder's loss; and the parts."""
+    """Negative ELBO per object, with q(z) by recognition; with `batch`, rays and the encoder's loss too. And parts."""
     model, recognition = networks
-    k0, k1 = jax.random.split(key)
-    mean, precision = jax.vmap(lambda o: recognition(description(o)))(batch.objects)
+    k0, k1, k2 = jax.random.split(key, 3)
+    mean, precision = jax.vmap(lambda o: recognition(description(o)))(solids.objects)
     z = mean + jax.random.normal(k0, mean.shape) / jnp.sqrt(precision)
     kl = jnp.mean(jax.vmap(kl_estimate, in_axes=(None, 0, 0, 0))(model, z, mean, precision))
     weights = jax.vmap(model.hyper)(z)
-    points = solid_points(batch, k1, config.points)
-    solid = jax.vmap(signed_distance)(batch.objects, points) <= 0.0
-    drawn = (batch.origin, batch.direction, batch.ray_rgb, batch.ray_range, batch.ray_weight, batch.turn)
-    each = _PerObject(points, solid, *map(jnp.asarray, drawn))
-    terms = _ray_terms if rays else _solid_terms
-    fit = jnp.mean(
-        map_with_gradient(_Bound(terms, (model.field, likelihood, config, 0.3)), config.map_batch, None, each, weights)
-    )
-    encoder = encoder_loss(model, batch, z, min(config.encode_objects, z.shape[0]))
+    each: tuple = (*shape_samples(solids, k1, config.points), *colour_samples(solids, k2, config.colours))
+    terms, encoder = _solid_terms, jnp.zeros(())
+    if batch is not None:
+        drawn = (batch.origin, batch.direction, batch.ray_rgb, batch.ray_range, batch.ray_weight, batch.turn)
+        terms, each = _ray_terms, (_ObjectRays(*map(jnp.asarray, drawn)), each)
+        encoder = encoder_loss(model, batch, z)
+    bound = _Bound(terms, (model.field, likelihood, config))
+    fit = jnp.mean(map_with_gradient(bound, config.map_batch, None, each, weights))
     return kl_weight * kl - fit + encoder, {"fit": fit, "kl": kl, "encoder": encoder}
 
 
@@ -193,7 +191,7 @@ class _Bound:
     terms: Callable
     constants: tuple
 
-    def __call__(self, _: Any, item: _PerObject, weights: Array) -> Array:
+    def __call__(self, _: Any, item: Any, weights: Array) -> Array:
         return self.terms(self.constants, item, weights)
 
 
@@ -202,45 +200,57 @@ class TrainState(eqx.Module):
 
     model: ProbNeRF
     recognition: Recognition
-    average: ProbNeRF
     optimiser: optax.OptState
     step: Array
 
 
 def optimiser_of(config: TrainConfig) -> optax.GradientTransformation:
-    """Adam (paper §2.2) with warm-up, cosine decay and clipping against the rare bad batch."""
-    schedule = optax.warmup_cosine_decay_schedule(
-        0.0, config.learning_rate, min(config.warmup, config.steps // 4), config.steps, config.final_learning_rate
-    )
-    return optax.chain(optax.clip_by_global_norm(200.0), optax.adam(schedule))
+    """Adam (paper §2.2) with clipping against the rare bad batch; warm-up and cosine decay in each phase."""
+
+    def schedule(solid: float, ray: float) -> optax.Schedule:
+        phases = [(solid, config.solid_steps), (ray, config.steps - config.solid_steps)]
+        parts = [
+            optax.warmup_cosine_decay_schedule(
+                0.0, peak, min(config.warmup, steps // 4), max(steps, 1), config.final_learning_rate
+            )
+            for peak, steps in phases
+        ]
+        return optax.join_schedules(parts, [config.solid_steps])
+
+    def labels(networks: tuple[ProbNeRF, Recognition]) -> tuple[ProbNeRF, Recognition]:
+        named = jax.tree.map(lambda _: "decoder", networks)
+        return eqx.tree_at(lambda n: n[0].encoder, named, jax.tree.map(lambda _: "encoder", networks[0].encoder))
+
+    rates = {
+        "decoder": optax.adam(schedule(config.learning_rate, config.ray_learning_rate)),
+        "encoder": optax.adam(schedule(config.learning_rate, config.learning_rate)),  # idle in the solid phase
+    }
+    return optax.chain(optax.clip_by_global_norm(200.0), optax.multi_transform(rates, labels))
 
 
 def initial_state(model: ProbNeRF, config: TrainConfig) -> TrainState:
     """A fresh run."""
-    average = jax.tree.map(jnp.copy, model)  # its own buffers: a step gives its inputs away
     size = description(sample_object(0)).shape[0]
     key = jax.random.fold_in(jax.random.key(config.seed), 1)
     recognition = Recognition(size, model.latent, model.preset.hyper_hidden, key)
     optimiser = optimiser_of(config).init((model, recognition))
-    return TrainState(model, recognition, average, optimiser, jnp.zeros((), jnp.int32))
+    return TrainState(model, recognition, optimiser, jnp.zeros((), jnp.int32))
 
 
 @eqx.filter_jit(donate="all-except-first")
 def train_step(
-    static: tuple[Likelihood, TrainConfig, bool], state: TrainState, batch: Batch
+    static: tuple[Likelihood, TrainConfig], state: TrainState, solids: Solids, batch: Batch | None
 ) -> tuple[TrainState, dict[str, Array]]:
-    """One update."""
-    likelihood, config, rays = static
+    """One update: of the solid phase without `batch`."""
+    likelihood, config = static
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
     kl_weight = jnp.clip(state.step / config.kl_warmup, 0.02, 1.0)
     (value, parts), gradient = jax.value_and_grad(loss, has_aux=True)(
-        (state.model, state.recognition), batch, key, kl_weight, likelihood, config, rays
+        (state.model, state.recognition), solids, batch, key, kl_weight, likelihood, config
     )
     update, optimiser = optimiser_of(config).update(gradient, state.optimiser)
     model, recognition = optax.apply_updates((state.model, state.recognition), update)
-    decay = jnp.minimum(config.average, (1.0 + state.step) / (10.0 + state.step))
-    average = jax.tree.map(lambda a, b: decay * a + (1.0 - decay) * b, state.average, model)
-    return TrainState(model, recognition, average, optimiser, state.step + 1), {"loss": value, **parts}
+    return TrainState(model, recognition, optimiser, state.step + 1), {"loss": value, **parts}
 
 
 def save_checkpoint(path: Path, state: TrainState) -> None:
@@ -254,15 +264,16 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
 
 
 def train(
-    model: ProbNeRF, views: ViewSet, likelihood: Likelihood, config: TrainConfig, folder: Path
+    model: ProbNeRF, solids: Solids, views: ViewSet, likelihood: Likelihood, config: TrainConfig, folder: Path
 ) -> Iterator[tuple[TrainState, dict[str, float]]]:
     """Run or resume in `folder`; yields (state, metrics) every `log_every` steps and appends them to history.jsonl.
 
+    `views` are pictures of the first so many objects of `solids`.
     Raises FloatingPointError on a non-finite loss, naming the step; the last checkpoint stays.
     """
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint, history = folder / "checkpoint.eqx", folder / "history.jsonl"
-    state = initial_state(model, config)
+    state = initial_state(jax.tree.map(jnp.copy, model), config)  # its own buffers: a step gives its inputs away
     settings = folder / "config.json"
     described = json.dumps(asdict(config), indent=1)
     if checkpoint.exists():
@@ -273,20 +284,22 @@ def train(
         kept = [line for line in lines if json.loads(line)["step"] <= int(state.step)]
         history.write_text("".join(line + "\n" for line in kept))
     settings.write_text(described)
-    objects = sample_objects([int(s) for s in views.seeds])
     strata = strata_of(views)
     start = int(state.step)
 
-    def batch_of(step: int) -> Batch:
-        size = config.ray_batch if step >= config.solid_steps else config.batch
-        return draw_batch(views, objects, strata, config, step, size)
+    def data_of(step: int) -> tuple[Solids, Batch | None]:
+        if step >= config.solid_steps:
+            batch = draw_batch(views, strata, config, step, config.ray_batch)
+            return solids[np.asarray(batch.rows)], batch
+        rng = np.random.default_rng([config.seed, step, 3])
+        return solids[rng.choice(len(solids.point), config.batch, replace=False)], None
 
     with ThreadPoolExecutor(1) as drawer:  # the next batch is drawn while this one is used
-        coming = drawer.submit(batch_of, start)
+        coming = drawer.submit(data_of, start)
         for step in range(start, config.steps):
-            batch = coming.result()
-            coming = drawer.submit(batch_of, step + 1)
-            state, parts = train_step((likelihood, config, step >= config.solid_steps), state, batch)
+            data = coming.result()
+            coming = drawer.submit(data_of, step + 1)
+            state, parts = train_step((likelihood, config), state, *data)
             done = step + 1
             if done % config.log_every == 0 or done == config.steps:
                 metrics = {k: float(v) for k, v in parts.items()}

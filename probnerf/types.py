@@ -39,7 +39,7 @@ class Observation(eqx.Module):
     limit: Float[
         Array, "n"
     ]  # FREE and UNKNOWN: the ray was seen to be empty of the object up to here (0: says nothing)
-    pose_sigma: Float[Array, "3"]  # prior standard deviations of x, y (cube units) and log-scale of the pose
+    pose_sigma: Float[Array, "4"]  # prior standard deviations: x, y (cube units), log-scale, range offset (cube units)
     colour_count: int = eqx.field(static=True)
 
     def __check_init__(self) -> None:
@@ -95,7 +95,7 @@ class Diagnostics(eqx.Module):
 
 
 class Posterior(eqx.Module):
-    """Weighted samples. Position vectors are [z | pose a, b, x, y, log-scale | delta], each a priori N(0, 1)."""
+    """Weighted samples. Positions are [z | a, b, x, y, log-scale, range offset | delta], each a priori N(0, 1)."""
 
     positions: Float[Array, "s d"]
     log_weights: Float[Array, "s"]  # normalised: logsumexp is 0

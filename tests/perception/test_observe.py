@@ -86,7 +86,11 @@ def test_a_half_hidden_object_has_wider_widths_and_a_fair_guess() -> None:
     foot = cube.to_cube(to_camera(np.zeros(3), T))
     assert cube.xy_sigma > alone.xy_sigma + 0.05 and cube.log_scale_sigma > alone.log_scale_sigma + 0.05
     assert np.abs(foot[:2]).max() < 2.0 * cube.xy_sigma
-    np.testing.assert_allclose(observation.pose_sigma, [cube.xy_sigma, cube.xy_sigma, cube.log_scale_sigma], rtol=1e-6)
+    np.testing.assert_allclose(
+        observation.pose_sigma,
+        [cube.xy_sigma, cube.xy_sigma, cube.log_scale_sigma, 0.005 / cube.half_extent],
+        rtol=1e-6,
+    )
 
 
 def test_free_rays_miss_the_object_and_meet_the_cube() -> None:

@@ -131,14 +131,14 @@ def _check(posteriors: list[Posterior], grid: GridPosterior) -> None:
 @pytest.mark.parametrize(("condition", "depth"), QUICK)
 def test_tempered_smc_is_the_posterior(condition, depth):
     args, grid = _scene(condition, depth)
-    _check([tempered_smc(jax.random.key(seed), log_likelihood, args, 7) for seed in (0, 1)], grid)
+    _check([tempered_smc(jax.random.key(seed), log_likelihood, args, 8) for seed in (0, 1)], grid)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("condition", "depth"), CONDITIONS)
 def test_tempered_smc_is_the_posterior_in_every_condition(condition, depth):
     args, grid = _scene(condition, depth)
-    posteriors = [tempered_smc(jax.random.key(seed), log_likelihood, args, 7) for seed in range(2, 6)]
+    posteriors = [tempered_smc(jax.random.key(seed), log_likelihood, args, 8) for seed in range(2, 6)]
     _check(posteriors, grid)
     assert abs(np.mean([float(posterior.log_evidence) for posterior in posteriors]) - grid.log_evidence) <= 0.3
     # The histogram is of the yaw alone; the sizes agree, too.
@@ -160,7 +160,7 @@ def test_tempered_smc_weighs_modes_that_the_mask_alone_cannot_tell_apart():
     grid = integrate(_each, args)
     front = grid.histogram()[[0, 1, 10, 11]].sum()
     assert 0.02 < front < 0.5  # the handle may point at the camera, too
-    _check([tempered_smc(jax.random.key(seed), log_likelihood, args, 7) for seed in range(4)], grid)
+    _check([tempered_smc(jax.random.key(seed), log_likelihood, args, 8) for seed in range(4)], grid)
 
 
 @pytest.mark.slow
@@ -172,7 +172,7 @@ def test_annealed_hmc_is_the_posterior_but_for_the_chains_that_annealing_left_be
     # what it does, not what a posterior sampler must.
     args, grid = _scene(condition, depth)
     config = AnnealedHMCConfig(chains=256, leapfrog_steps=5, keep=4)
-    posterior = annealed_hmc(jax.random.key(0), log_likelihood, args, 7, config)
+    posterior = annealed_hmc(jax.random.key(0), log_likelihood, args, 8, config)
     order = np.argsort(grid.log_likelihood)
     lowest = grid.log_likelihood[order][np.searchsorted(np.cumsum(grid.probability[order]), 0.001)] - 2.0
     last = slice(-config.chains, None)

@@ -1,6 +1,8 @@
 """The foam renderer against a slow loop in float64, its gradients against finite differences, and its edge cases."""
 
 import equinox as eqx
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,8 +54,13 @@ class Slow:
             point = turn @ (point - base - [x, y, 0]) / np.exp(log_scale) + base
             direction = turn @ direction
         field = self.field
-        k0, b0, k1, b1, k2, b2, k3, b3, k4, b4, k5, b5 = self.layers
-        place = [*point, np.sqrt(point[0] ** 2 + point[1] ** 2 + 1e-4)] if field.radial else point
+        k0, b0, k1, b1, k2, b2, k3, b3, k4, b4, k5, b5, *fitted = self.layers
+        place: Any = point
+        if field.fitted:
+            base = np.array([0, 0, BASE_Z])
+            place = (point - base - fitted[1]) * np.exp(fitted[0]) + base
+        if field.radial:
+            place = [*place, np.sqrt(place[0] ** 2 + place[1] ** 2 + 1e-4)]
         position = _encode(np.asarray(place), field.octaves)
         hidden = np.maximum(np.maximum(position @ k0 + b0, 0) @ k1 + b1, 0)
         u = np.clip(1 - max(np.abs(point).max() - 1, 5 * (BASE_Z - 0.02 - point[2])) / 0.1, 0, 1)
@@ -165,13 +172,13 @@ def test_crossings_are_exact_for_a_shifted_lattice_from_near_and_far(distance):
     )
 
 
-def test_spacing_is_the_mean_gap_and_one_sided_at_the_ends():
+def test_gap_before_is_the_distance_to_the_previous_crossing():
     t = jnp.array([[1.0, 1.1, 1.1, 1.4, FAR, FAR], [2.0, 2.5, FAR, FAR, FAR, FAR], [FAR] * 6])
-    expected = [[0.1, 0.05, 0.15, 0.3, 0, 0], [0.5, 0.5, 0, 0, 0, 0], [0] * 6]
-    np.testing.assert_allclose(jax.jit(foam.spacing)(t), expected, atol=1e-6)
+    expected = [[0.1, 0.1, 0.0, 0.3, 0, 0], [0.5, 0.5, 0, 0, 0, 0], [0] * 6]
+    np.testing.assert_allclose(jax.jit(foam.gap_before)(t), expected, atol=1e-6)
     along = Rays(jnp.array([[3.0, 0.01, 0.01]]), jnp.array([[-1.0, 0.0, 0.0]]))
     t = _crossings(along, Lattice(16))
-    np.testing.assert_allclose(foam.spacing(t)[t < FAR], 2 / 16, rtol=1e-5)
+    np.testing.assert_allclose(foam.gap_before(t)[t < FAR], 2 / 16, rtol=1e-5)
 
 
 def test_the_window_is_one_in_the_cube_and_zero_beyond_its_margin():

@@ -19,7 +19,7 @@ def _observed(position: np.ndarray) -> Observation:
     T = look_at(np.array([4.0, 0.0, 2.5]), np.zeros(3))
     origin, direction = pinhole_rays(T, 12 * np.linalg.norm(T[:3, 3]) / 1.2, 24)
     rays = Rays(jnp.asarray(origin), jnp.asarray(direction))
-    pose_sigma = jnp.array([0.1, 0.1, 0.1])
+    pose_sigma = jnp.array([0.1, 0.1, 0.1, 0.0])
     weights, pose = jax.jit(split_position)(MODEL, LIKELIHOOD, jnp.asarray(position), pose_sigma)
     picture = jax.jit(foam.render)(MODEL.field, weights, rays, LIKELIHOOD.lattice, pose)
     hit = picture.opacity > 0.5
@@ -82,7 +82,7 @@ def test_a_visible_handle_s_yaw_and_the_body_s_size_are_found_again():
     truth = np.array([0.5, 0.4, np.cos(yaw), np.sin(yaw), 0.3, -0.4, 0.2], np.float32)
     observation = _observed(truth)
     angles = np.arange(6) * np.pi / 3 + 0.4
-    starts = np.zeros((6, 7), np.float32)
+    starts = np.zeros((6, 8), np.float32)
     starts[:, 2], starts[:, 3] = np.cos(angles), np.sin(angles)
     best, values = map_estimate(MODEL, LIKELIHOOD, observation, jnp.asarray(starts), MAPConfig(steps=120))
     assert np.isfinite(values).all() and values.shape == (4,)

@@ -27,8 +27,8 @@ from probnerf.types import FREE, OBJECT, UNKNOWN, Observation, Rays
 
 MODEL = CylinderModel()
 LIKELIHOOD = Likelihood(Lattice(16))
-# z_0 (handle length), z_1 (radius), a, b, x, y, log-scale: a handle that points at -y, to the picture's left
-POSITION = jnp.array([0.3, 0.1, 0.1, -1.2, 0.0, 0.0, 0.0])
+# z_0 (handle length), z_1 (radius), a, b, x, y, log-scale, range offset: a handle at -y, to the picture's left
+POSITION = jnp.array([0.3, 0.1, 0.1, -1.2, 0.0, 0.0, 0.0, 0.0])
 
 
 def _says(rays: Rays, status: int, **values) -> Observation:
@@ -43,7 +43,7 @@ def _says(rays: Rays, status: int, **values) -> Observation:
         range_sigma=jnp.full(n, 0.02),
         range_valid=jnp.zeros(n, bool),
         limit=jnp.zeros(n),
-        pose_sigma=jnp.array([0.1, 0.1, 0.1]),
+        pose_sigma=jnp.array([0.1, 0.1, 0.1, 0.0]),
         colour_count=n,
     )
     return Observation(**{**fields, **values})
@@ -58,7 +58,7 @@ def _terms(observation: Observation, position=POSITION, model=MODEL, likelihood=
 
 @eqx.filter_jit
 def _picture(rays: Rays, position=POSITION):
-    weights, pose = split_position(MODEL, LIKELIHOOD, position, jnp.array([0.1, 0.1, 0.1]))
+    weights, pose = split_position(MODEL, LIKELIHOOD, position, jnp.array([0.1, 0.1, 0.1, 0.0]))
     return foam.render(MODEL.field, weights, rays, LIKELIHOOD.lattice, pose)
 
 
@@ -127,6 +127,20 @@ def test_a_limit_is_no_news_for_an_object_pixel(rays):
     np.testing.assert_array_equal(_terms(pixel), _terms(replace(pixel, limit=jnp.full(60, 4.0))))
 
 
+def test_a_range_offset_is_a_bias_that_all_ranges_share(rays):
+    """log p(range | offset) is log p(range - offset | 0), and the offset says nothing where no range was measured."""
+    model, likelihood = MODEL, LIKELIHOOD
+    pixel = _says(rays, OBJECT, range_valid=jnp.ones(60, bool), pose_sigma=jnp.array([0.1, 0.1, 0.1, 0.05]))
+    t = foam.crossings(rays, likelihood.lattice)
+    value = jax.jit(lambda o, q: log_likelihood_one(model, likelihood, o, t, q))
+    biased = POSITION.at[-1].set(1.5)
+    moved = replace(pixel, range=pixel.range + 1.5 * 0.05)
+    assert float(value(moved, biased)) == pytest.approx(float(value(pixel, POSITION)), rel=1e-5)
+    assert abs(float(value(pixel, biased) - value(pixel, POSITION))) > 1.0
+    unmeasured = replace(pixel, range_valid=jnp.zeros(60, bool))
+    assert float(value(unmeasured, biased)) == float(value(unmeasured, POSITION))
+
+
 def test_padding_says_exactly_nothing():
     model, likelihood, observation, _ = scene("seen", depth=True)
     count = observation.status.shape[0]
@@ -172,7 +186,7 @@ def test_the_power_multiplies_the_log_likelihood():
 @pytest.mark.parametrize("batch_size", [None, 3])
 def test_mapping_with_the_gradient_is_mapping_and_its_gradient(batch_size):
     args = scene("half", depth=True)
-    positions = jax.random.normal(jax.random.key(0), (8, 7))
+    positions = jax.random.normal(jax.random.key(0), (8, 8))
     shift = jnp.linspace(-0.2, 0.2, 8)
     cotangent = jnp.linspace(-1.0, 2.0, 8)
 
@@ -200,7 +214,7 @@ def test_gradients_are_those_of_finite_differences():
         q = POSITION.astype(jnp.float64) + 0.05
         gradient = jax.jit(jax.grad(value))(q)
         for i in range(4):
-            step = 1e-6 * jnp.eye(7)[i]
+            step = 1e-6 * jnp.eye(8)[i]
             assert float(gradient[i]) == pytest.approx(
                 float(value(q + step) - value(q - step)) / 2e-6, rel=1e-4, abs=1e-3
             )
@@ -209,9 +223,9 @@ def test_gradients_are_those_of_finite_differences():
 
 def test_likelihood_and_gradient_are_finite_wherever_a_chain_may_go():
     model, likelihood, observation, t = scene("seen", depth=True)
-    free = replace(observation, pose_sigma=jnp.array([0.3, 0.3, 0.3]))
-    positions = jax.random.normal(jax.random.key(1), (64, 7)) * jnp.geomspace(0.1, 30.0, 64)[:, None]
-    positions = jnp.concatenate([positions, jnp.zeros((1, 7)), 30.0 * jnp.ones((1, 7)), -30.0 * jnp.ones((1, 7))])
+    free = replace(observation, pose_sigma=jnp.array([0.3, 0.3, 0.3, 0.1]))
+    positions = jax.random.normal(jax.random.key(1), (64, 8)) * jnp.geomspace(0.1, 30.0, 64)[:, None]
+    positions = jnp.concatenate([positions, jnp.zeros((1, 8)), 30.0 * jnp.ones((1, 8)), -30.0 * jnp.ones((1, 8))])
     values, gradients = jax.jit(
         jax.vmap(jax.value_and_grad(lambda q: log_likelihood_one(model, likelihood, free, t, q)))
     )(positions)
@@ -222,9 +236,9 @@ def test_likelihood_and_gradient_are_finite_wherever_a_chain_may_go():
 def test_a_network_s_likelihood_and_gradient_are_finite(size):
     model = eqx.filter_jit(lambda: ProbNeRF(PRESETS["tiny"], jax.random.key(0)))()
     likelihood = Likelihood(Lattice(8), sample_delta=True)
-    assert likelihood.dim(model) == 4 + 5 + model.field.size
+    assert likelihood.dim(model) == 4 + 6 + model.field.size
     _, _, observation, _ = scene("seen", depth=True)
-    free = replace(observation, pose_sigma=jnp.array([0.05, 0.05, 0.1]))
+    free = replace(observation, pose_sigma=jnp.array([0.05, 0.05, 0.1, 0.02]))
     t = foam.crossings(free.rays, likelihood.lattice)
     positions = size * jax.random.normal(jax.random.key(1), (8, likelihood.dim(model)))
 
@@ -241,15 +255,15 @@ def test_delta_moves_the_weights_by_root_alpha():
     model = eqx.filter_jit(lambda: ProbNeRF(PRESETS["tiny"], jax.random.key(0)))()
     position = jax.random.normal(jax.random.key(2), (4 + model.field.size,))
     settings = Likelihood(Lattice(8), sample_pose=False, sample_delta=True)
-    weights, pose = split_position(model, settings, position, jnp.zeros(3))
+    weights, pose = split_position(model, settings, position, jnp.zeros(4))
     assert pose is None and settings.dim(model) == position.size
     np.testing.assert_allclose(weights - model.decode(position[:4]), 0.025 * position[4:], atol=1e-5)
     still = Likelihood(Lattice(8), sample_pose=False)
-    assert still.dim(model) == 4 and Likelihood(Lattice(8)).dim(MODEL) == 7
+    assert still.dim(model) == 4 and Likelihood(Lattice(8)).dim(MODEL) == 8
 
 
 def test_the_pose_is_read_off_its_latents_and_finite_at_the_origin():
-    sigma = jnp.array([0.1, 0.2, 0.3])
+    sigma = jnp.array([0.1, 0.2, 0.3, 0.0])
     angles = jnp.linspace(-3.0, 3.0, 13)
     latents = jnp.stack([2 * jnp.cos(angles), 2 * jnp.sin(angles), angles, -angles, 0.5 * angles], axis=-1)
     pose = jax.jit(pose_of)(latents, sigma)

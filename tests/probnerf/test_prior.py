@@ -81,7 +81,9 @@ def test_a_coupling_cannot_overflow():
 @pytest.mark.parametrize("name", ["small", "tiny"])
 def test_the_hypernetwork_makes_every_weight_of_the_field(name):
     preset = PRESETS[name]
-    hyper = _shaken(lambda key: HyperNetwork(preset.latent, preset.hyper_hidden, preset.field, key), size=0.0)
+    hyper = _shaken(
+        lambda key: HyperNetwork(preset.latent, preset.hyper_hidden, preset.field, preset.smooth, key), size=0.0
+    )
     z = jax.random.normal(jax.random.key(1), (8, preset.latent))
     weights = jax.jit(jax.vmap(hyper))(z)
     assert weights.shape == (8, preset.field.size)

@@ -13,16 +13,17 @@ import pytest
 
 from probnerf import foam
 from probnerf.batches import draw_batch, strata_of
-from probnerf.families.tabletop import sample_objects
+from probnerf.families.tabletop import signed_distance
 from probnerf.model import Likelihood
 from probnerf.prior import PRESETS, ProbNeRF
+from probnerf.solids import Solids, colour_samples, draw_solids, shape_samples
 from probnerf.store import load_prior, save_prior
 from probnerf.train import TrainConfig, TrainState, train
 from probnerf.views import ViewSet, draw_views
 
 CONFIG = TrainConfig(
-    steps=8, solid_steps=4, batch=4, ray_batch=2, encode_objects=2, views=2, object_rays=8, near_rays=4, far_rays=4,
-    points=24, warmup=2, checkpoint_every=3, log_every=1,
+    steps=8, solid_steps=4, batch=4, ray_batch=2, views=2, object_rays=8, near_rays=4, far_rays=4,
+    points=24, colours=8, warmup=2, checkpoint_every=3, log_every=1,
 )  # fmt: skip
 LIKELIHOOD = Likelihood(lattice=foam.Lattice(8, 1.0))
 
@@ -32,19 +33,24 @@ def views() -> ViewSet:
     return draw_views(np.arange(6), 3, PRESETS["tiny"].image_size)
 
 
+@pytest.fixture(scope="module")
+def solids() -> Solids:
+    return draw_solids(np.arange(8))
+
+
 def model() -> ProbNeRF:
     return ProbNeRF(PRESETS["tiny"], jax.random.key(0))
 
 
-def run(views: ViewSet, folder: Path, steps: int | None = None) -> TrainState:
-    *_, (state, _) = islice(train(model(), views, LIKELIHOOD, CONFIG, folder), steps)
+def run(solids: Solids, views: ViewSet, folder: Path, steps: int | None = None) -> TrainState:
+    *_, (state, _) = islice(train(model(), solids, views, LIKELIHOOD, CONFIG, folder), steps)
     return state
 
 
-def test_a_killed_run_resumes_with_identical_results(views: ViewSet, tmp_path: Path) -> None:
-    whole = run(views, tmp_path / "whole")
-    run(views, tmp_path / "killed", steps=5)  # the last checkpoint is of step 3: steps 4 and 5 are lost
-    resumed = run(views, tmp_path / "killed")
+def test_a_killed_run_resumes_with_identical_results(solids: Solids, views: ViewSet, tmp_path: Path) -> None:
+    whole = run(solids, views, tmp_path / "whole")
+    run(solids, views, tmp_path / "killed", steps=5)  # the last checkpoint is of step 3: steps 4 and 5 are lost
+    resumed = run(solids, views, tmp_path / "killed")
     assert int(resumed.step) == CONFIG.steps
     for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(resumed), strict=True):
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
@@ -53,28 +59,27 @@ def test_a_killed_run_resumes_with_identical_results(views: ViewSet, tmp_path: P
     assert [json.loads(line)["rays"] for line in lines] == [False] * 4 + [True] * 4
 
 
-def test_another_recipe_does_not_continue_a_run(views: ViewSet, tmp_path: Path) -> None:
-    run(views, tmp_path, steps=4)
-    other = train(model(), views, LIKELIHOOD, replace(CONFIG, learning_rate=1.0), tmp_path)
+def test_another_recipe_does_not_continue_a_run(solids: Solids, views: ViewSet, tmp_path: Path) -> None:
+    run(solids, views, tmp_path, steps=4)
+    other = train(model(), solids, views, LIKELIHOOD, replace(CONFIG, learning_rate=1.0), tmp_path)
     with pytest.raises(ValueError, match="another recipe"):
         next(other)
 
 
-def test_a_loss_that_is_no_number_is_named_with_its_step(views: ViewSet, tmp_path: Path) -> None:
+def test_a_loss_that_is_no_number_is_named_with_its_step(solids: Solids, views: ViewSet, tmp_path: Path) -> None:
     broken = eqx.tree_at(lambda m: m.hyper.bias, model(), jnp.full_like(model().hyper.bias, jnp.nan))
     with pytest.raises(FloatingPointError, match="step 1"):
-        next(train(broken, views, LIKELIHOOD, CONFIG, tmp_path))
+        next(train(broken, solids, views, LIKELIHOOD, CONFIG, tmp_path))
 
 
 def test_weighted_rays_estimate_the_mean_over_all_pixels(views: ViewSet) -> None:
     """E[sum of weight x value] is the mean of a value over every pixel of every view, whatever the strata."""
-    objects = sample_objects([int(s) for s in views.seeds])
     config = replace(CONFIG, object_rays=64, near_rays=32, far_rays=32)
     strata = strata_of(views)
     estimates = []
     for step in range(60):
         chosen = np.random.default_rng([config.seed, step, 3]).choice(len(views.seeds), 4, replace=False)
-        batch = draw_batch(views, objects, strata, config, step, 4)
+        batch = draw_batch(views, strata, config, step, 4)
         value = np.asarray(batch.ray_rgb).sum(-1) + 2.0 * (np.asarray(batch.ray_range) > 0)
         totals = (np.asarray(batch.ray_weight) * value).sum(1)
         truth = (views.rgb[chosen] / 255.0).sum(-1).mean((1, 2, 3)) + 2.0 * (views.range[chosen] > 0).mean((1, 2, 3))
@@ -82,6 +87,25 @@ def test_weighted_rays_estimate_the_mean_over_all_pixels(views: ViewSet) -> None
     error = np.concatenate(estimates)
     assert abs(error.mean()) < 4 * error.std() / np.sqrt(error.size)
     assert error.std() < 0.2
+
+
+def test_solid_samples_are_what_the_objects_are(solids: Solids) -> None:
+    """Surface points lie on the surface, normals have length 1, labels are the distance's sign, colours lie behind."""
+    distance = np.asarray(jax.vmap(signed_distance)(solids.objects, jnp.asarray(solids.point)))
+    assert np.mean(solids.valid) > 0.7
+    assert np.abs(distance[np.asarray(solids.valid)]).max() < 2e-3
+    np.testing.assert_allclose(np.linalg.norm(solids.normal, axis=-1)[np.asarray(solids.valid)], 1.0, atol=1e-4)
+    again = draw_solids(np.array([3]))  # a function of the seed alone
+    np.testing.assert_array_equal(again.point[0], solids.point[3])
+
+    points, inside = shape_samples(solids, jax.random.key(0), 400)
+    assert points.shape == (8, 400, 3)
+    assert 0.1 < float(jnp.mean(inside)) < 0.6
+    place, view, rgb, valid = colour_samples(solids, jax.random.key(1), 100)
+    depth = -np.asarray(jax.vmap(signed_distance)(solids.objects, place))[np.asarray(valid)]
+    assert np.mean((depth > -3e-3) & (depth < 0.043)) > 0.98
+    np.testing.assert_allclose(np.linalg.norm(view, axis=-1), 1.0, atol=1e-5)
+    assert rgb.min() >= 0.0 and rgb.max() <= 1.0
 
 
 def test_a_prior_survives_its_file(tmp_path: Path) -> None:
