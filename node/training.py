@@ -46,8 +46,9 @@ def train(options: Training, out: Console, err: Console) -> bool:
     preset, config, folder = PRESETS[options.preset], options.recipe, options.out
     if not 1 <= options.objects <= len(TRAIN_SEEDS):
         raise ValueError(f"--objects is {options.objects}; give 1 to {len(TRAIN_SEEDS)}")
-    if not 1 <= options.pictured <= options.objects:
-        raise ValueError(f"--pictured is {options.pictured}; give 1 to {options.objects}, the number of objects")
+    if options.pictured < 1:
+        raise ValueError(f"--pictured is {options.pictured}; give 1 or more")
+    pictured = min(options.pictured, options.objects)
     history, curves, weights = folder / "history.jsonl", folder / "curves.png", folder / "prior.safetensors"
     likelihood = Likelihood(lattice=foam.Lattice(preset.lattice, 1.0, 9 * preset.lattice // 4))
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -57,9 +58,9 @@ def train(options: Training, out: Console, err: Console) -> bool:
             sampling = progress.add_task("objects", total=options.objects)
             seeds = np.asarray(TRAIN_SEEDS[: options.objects])
             solids = draw_solids(seeds, progress=lambda done, total: progress.update(sampling, completed=done))
-            drawing = progress.add_task("pictures", total=options.pictured)
+            drawing = progress.add_task("pictures", total=pictured)
             views = draw_views(
-                seeds[: options.pictured],
+                seeds[:pictured],
                 options.pictures,
                 preset.image_size,
                 progress=lambda done, total: progress.update(drawing, completed=done),
@@ -82,7 +83,7 @@ def train(options: Training, out: Console, err: Console) -> bool:
     story = {
         "family": "tabletop",
         "seeds": [TRAIN_SEEDS.start, TRAIN_SEEDS.start + options.objects],
-        "pictured": options.pictured,
+        "pictured": pictured,
         "pictures": options.pictures,
         "recipe": asdict(config),
         "steps": int(state.step),

@@ -41,8 +41,8 @@ from probnerf.views import ViewSet, camera_features, encoder_image
 class TrainConfig:
     """The recipe. Steps count optimiser updates; every number travels with the weights."""
 
-    steps: int = 60_000
-    solid_steps: int = 55_000  # of these, the first so many are the solid phase
+    steps: int = 48_500
+    solid_steps: int = 44_000  # of these, the first so many are the solid phase
     batch: int = 64  # objects per step in the solid phase
     ray_batch: int = 16  # objects per step afterwards
     views: int = 3  # encoder views per object; a random number of them is used
@@ -52,7 +52,7 @@ class TrainConfig:
     points: int = 512  # solid samples per object
     colours: int = 192  # surface colours per object
     finer: float = 2.0  # solid samples are opaque on a lattice finer by this
-    grazing: float = 4.0  # empty ones transparent to a ray that meets so many faces there
+    grazing: float = 1.0  # empty ones are transparent to a ray that meets so many faces there
     effective_rays: float = 1500.0  # N_rays: independent residuals per object
     effective_points: float = 10_000.0  # N_points
     effective_colours: float = 800.0  # N_colours
@@ -208,14 +208,14 @@ def optimiser_of(config: TrainConfig) -> optax.GradientTransformation:
     """Adam (paper §2.2) with clipping against the rare bad batch; warm-up and cosine decay in each phase."""
 
     def schedule(solid: float, ray: float) -> optax.Schedule:
-        phases = [(solid, config.solid_steps), (ray, config.steps - config.solid_steps)]
+        first = min(config.solid_steps, config.steps)
         parts = [
             optax.warmup_cosine_decay_schedule(
                 0.0, peak, min(config.warmup, steps // 4), max(steps, 1), config.final_learning_rate
             )
-            for peak, steps in phases
+            for peak, steps in ((solid, first), (ray, config.steps - first))
         ]
-        return optax.join_schedules(parts, [config.solid_steps])
+        return optax.join_schedules(parts, [first])
 
     def labels(networks: tuple[ProbNeRF, Recognition]) -> tuple[ProbNeRF, Recognition]:
         named = jax.tree.map(lambda _: "decoder", networks)

@@ -11,6 +11,7 @@ import pytest
 
 import node.training
 from node.__main__ import main
+from probnerf.solids import Solids
 from probnerf.store import load_prior
 from probnerf.train import TrainConfig
 from probnerf.views import ViewSet
@@ -20,7 +21,7 @@ from probnerf.views import ViewSet
 class State:
     """What of a training state is read."""
 
-    average: Any
+    model: Any
     step: int
 
 
@@ -31,8 +32,10 @@ class Trainer:
         self.error: BaseException | None = None
         self.asked: dict[str, Any] = {}
 
-    def __call__(self, model: Any, views: ViewSet, likelihood: Any, config: TrainConfig, folder: Path) -> Iterator:
-        self.asked = {"views": views, "config": config, "likelihood": likelihood}
+    def __call__(
+        self, model: Any, solids: Solids, views: ViewSet, likelihood: Any, config: TrainConfig, folder: Path
+    ) -> Iterator:
+        self.asked = {"solids": solids, "views": views, "config": config, "likelihood": likelihood}
         folder.mkdir(parents=True, exist_ok=True)
         for step in (config.steps // 2, config.steps):
             metrics = {"step": step, "loss": 3.0 / step, "fit": -1.0, "kl": 2.0}
@@ -63,6 +66,7 @@ def test_the_recipe_is_handed_over_and_the_weights_exported(
     assert trainer.asked["config"] == TrainConfig(steps=10, seed=4)
     views = trainer.asked["views"]
     assert np.array_equal(views.seeds, [0, 1, 2]) and views.rgb.shape == (3, 2, 16, 16, 3)
+    assert len(trainer.asked["solids"].point) == 3
     prior = load_prior(folder / "prior.safetensors", preset="tiny")
     assert prior.metadata["seeds"] == [0, 3] and prior.metadata["steps"] == 10
     assert prior.metadata["recipe"]["seed"] == 4 and prior.metadata["revision"]

@@ -1,8 +1,8 @@
 """The foam renderer against a slow loop in float64, its gradients against finite differences, and its edge cases."""
 
-import equinox as eqx
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
