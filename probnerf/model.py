@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from probnerf import foam
@@ -217,8 +218,22 @@ map_with_gradient.defvjp(_map_forward, _map_backward)
 def log_likelihood(
     args: tuple[Model, Likelihood, Observation, Float[Array, "n m"]], positions: Float[Array, "p d"]
 ) -> Float[Array, "p"]:
-    """Batched log-likelihood for the samplers; differentiable in `positions` only."""
-    return map_with_gradient(_one_particle, None, args, None, positions)
+    """Batched log-likelihood for the samplers; differentiable in `positions` only.
+
+    Particles are shared out over JAX's devices where their number allows: one CPU core moves one particle at a time, so
+    a CPU counts as several devices (`JAX_NUM_CPU_DEVICES`).
+    """
+
+    def mapped(args, positions):
+        return map_with_gradient(_one_particle, None, args, None, positions)
+
+    devices = jax.devices()
+    if len(devices) == 1 or positions.shape[0] % len(devices):
+        return mapped(args, positions)
+    mesh = jax.sharding.Mesh(np.array(devices), ("particles",))
+    whole, split = jax.sharding.PartitionSpec(), jax.sharding.PartitionSpec("particles")
+    shared = jax.shard_map(mapped, mesh=mesh, in_specs=(whole, split), out_specs=split, check_vma=False)
+    return shared(args, positions)
 
 
 def _one_particle(args, _, position):

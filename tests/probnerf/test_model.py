@@ -1,5 +1,8 @@
 """The pixel likelihood: a density where it says so, silent where it must be, smooth everywhere."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import equinox as eqx
@@ -230,6 +233,27 @@ def test_likelihood_and_gradient_are_finite_wherever_a_chain_may_go():
         jax.vmap(jax.value_and_grad(lambda q: log_likelihood_one(model, likelihood, free, t, q)))
     )(positions)
     assert np.isfinite(gradients).all() and np.isfinite(values).all()
+
+
+def test_particles_shared_out_over_devices_have_the_same_likelihood():
+    """Four particles on two CPU devices (of a process of its own) against one device."""
+    code = """
+import jax, numpy as np
+from probnerf.analytic import scene
+from probnerf.model import log_likelihood
+q = jax.random.normal(jax.random.key(0), (4, 8))
+args = scene("seen", depth=True)
+both = jax.jit(lambda a, q: jax.value_and_grad(lambda q: log_likelihood(a, q).sum())(q))
+print(len(jax.devices()), *np.concatenate([np.ravel(x) for x in both(args, q)]))
+"""
+    found = []
+    for devices in ("1", "2"):
+        environment = {**os.environ, "JAX_NUM_CPU_DEVICES": devices}
+        run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+        count, *numbers = run.stdout.split()
+        assert count == devices
+        found.append(np.array(numbers, float))
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-4, atol=1e-3)
 
 
 @pytest.mark.parametrize("size", [0.1, 3.0, 100.0])  # at 100 every face is saturated or empty
