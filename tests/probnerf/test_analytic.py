@@ -119,10 +119,10 @@ def test_object_pixels_are_put_first_and_nothing_else_changes():
 # The samplers.
 
 
-def _check(posteriors: list[Posterior], grid: GridPosterior, mean_distance: float = 0.1) -> None:
+def _check(posteriors: list[Posterior], grid: GridPosterior) -> None:
     """One run's total variation scatters (0.00 to 0.11, mean 0.04, measured: 128 particles): a few are averaged."""
     assert all(posterior.result == "converged" for posterior in posteriors)
-    assert np.mean([total_variation(_yaw(posterior), grid.histogram()) for posterior in posteriors]) <= mean_distance
+    assert np.mean([total_variation(_yaw(posterior), grid.histogram()) for posterior in posteriors]) <= 0.1
     for posterior in posteriors:
         error = max(0.5, 3.0 * float(posterior.log_evidence_se))
         assert abs(float(posterior.log_evidence) - grid.log_evidence) <= error
@@ -160,8 +160,8 @@ def test_tempered_smc_weighs_modes_that_the_mask_alone_cannot_tell_apart():
     grid = integrate(_each, args)
     front = grid.histogram()[[0, 1, 10, 11]].sum()
     assert 0.02 < front < 0.5  # the handle may point at the camera, too
-    posteriors = [tempered_smc(jax.random.key(seed), log_likelihood, args, 8) for seed in range(4)]
-    _check(posteriors, grid, mean_distance=0.15)  # two far modes: one run's scatter is 0.08 to 0.13 (measured)
+    posteriors = [tempered_smc(jax.random.key(seed), log_likelihood, args, 8) for seed in range(8)]
+    _check(posteriors, grid)  # eight: two far modes scatter more
     together = np.mean([_yaw(posterior) for posterior in posteriors], axis=0)
     assert total_variation(together, grid.histogram()) <= 0.1
 

@@ -92,7 +92,7 @@ def test_weighted_rays_estimate_the_mean_over_all_pixels(views: ViewSet) -> None
 def test_solid_samples_are_what_the_objects_are(solids: Solids) -> None:
     """Surface points lie on the surface, normals have length 1, labels are the distance's sign, colours lie behind."""
     distance = np.asarray(jax.vmap(signed_distance)(solids.objects, jnp.asarray(solids.point)))
-    assert np.mean(solids.valid) > 0.7
+    assert np.mean(solids.valid) > 0.99
     assert np.abs(distance[np.asarray(solids.valid)]).max() < 2e-3
     np.testing.assert_allclose(np.linalg.norm(solids.normal, axis=-1)[np.asarray(solids.valid)], 1.0, atol=1e-4)
     again = draw_solids(np.array([3]))  # a function of the seed alone
