@@ -17,7 +17,7 @@ from probnerf.families.tabletop import TRAIN_SEEDS
 from probnerf.model import Likelihood
 from probnerf.prior import PRESETS, ProbNeRF
 from probnerf.solids import draw_solids
-from probnerf.store import save_prior
+from probnerf.store import load_prior, save_prior
 from probnerf.views import draw_views
 
 
@@ -29,6 +29,8 @@ class Training:
     """Folder of the run: checkpoint, history, curves.png and, in the end, prior.safetensors."""
     preset: Literal["small", "paper", "tiny"] = "small"
     """Sizes of the model: small for two CPU cores, the paper's, or tiny for a trial."""
+    start: Path | None = None
+    """Weights to go on from, of the same preset; give --frozen-steps with it. Random ones by default."""
     objects: int = 40_000
     """Training objects: the first seeds of the family."""
     pictured: int = 4_000
@@ -49,6 +51,7 @@ def train(options: Training, out: Console, err: Console) -> bool:
     if options.pictured < 1:
         raise ValueError(f"--pictured is {options.pictured}; give 1 or more")
     pictured = min(options.pictured, options.objects)
+    begun = None if options.start is None else load_prior(options.start, preset=options.preset)
     history, curves, weights = folder / "history.jsonl", folder / "curves.png", folder / "prior.safetensors"
     likelihood = Likelihood(lattice=foam.Lattice(preset.lattice, 1.0, 9 * preset.lattice // 4))
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -66,7 +69,10 @@ def train(options: Training, out: Console, err: Console) -> bool:
                 progress=lambda done, total: progress.update(drawing, completed=done),
             )
             steps = progress.add_task("steps", total=config.steps)
-            model = ProbNeRF(preset, np.array([0, config.seed], np.uint32))  # type: ignore[arg-type]  # a raw key
+            if begun is not None:
+                model = begun.model
+            else:
+                model = ProbNeRF(preset, np.array([0, config.seed], np.uint32))  # type: ignore[arg-type]  # a raw key
             for state, metrics in training.train(model, solids, views, likelihood, config, folder):  # noqa: B007
                 text = "steps  " + "  ".join(f"{k} {v:.4g}" for k, v in metrics.items() if k != "step")
                 progress.update(steps, completed=int(metrics["step"]), description=text)
@@ -88,6 +94,7 @@ def train(options: Training, out: Console, err: Console) -> bool:
         "recipe": asdict(config),
         "steps": int(state.step),
         "revision": _revision(),
+        "start": None if begun is None else {"hash": begun.hash, **begun.metadata},
         "gate": None,
     }
     save_prior(weights, state.model, story)

@@ -60,6 +60,7 @@ class TrainConfig:
     ray_learning_rate: float = 3e-4  # of all but the encoder, in the ray phase
     final_learning_rate: float = 2e-5
     warmup: int = 500
+    frozen_steps: int = 0  # the decoder stands still so long: where it is trained already, recognition comes to it
     kl_warmup: int = 2_000
     seed: int = 0
     checkpoint_every: int = 500
@@ -207,22 +208,24 @@ class TrainState(eqx.Module):
 def optimiser_of(config: TrainConfig) -> optax.GradientTransformation:
     """Adam (paper §2.2) with clipping against the rare bad batch; warm-up and cosine decay in each phase."""
 
-    def schedule(solid: float, ray: float) -> optax.Schedule:
+    def schedule(solid: float, ray: float, frozen: int = 0) -> optax.Schedule:
         first = min(config.solid_steps, config.steps)
+        still = min(frozen, first)
         parts = [
             optax.warmup_cosine_decay_schedule(
                 0.0, peak, min(config.warmup, steps // 4), max(steps, 1), config.final_learning_rate
             )
-            for peak, steps in ((solid, first), (ray, config.steps - first))
+            for peak, steps in ((solid, first - still), (ray, config.steps - first))
         ]
-        return optax.join_schedules(parts, [first])
+        return optax.join_schedules([optax.constant_schedule(0.0), *parts], [still, first])
 
     def labels(networks: tuple[ProbNeRF, Recognition]) -> tuple[ProbNeRF, Recognition]:
-        named = jax.tree.map(lambda _: "decoder", networks)
-        return eqx.tree_at(lambda n: n[0].encoder, named, jax.tree.map(lambda _: "encoder", networks[0].encoder))
+        model, recognition = (jax.tree.map(lambda _: name, n) for name, n in zip(rates, networks, strict=False))
+        return eqx.tree_at(lambda m: m.encoder, model, jax.tree.map(lambda _: "encoder", model.encoder)), recognition
 
     rates = {
-        "decoder": optax.adam(schedule(config.learning_rate, config.ray_learning_rate)),
+        "decoder": optax.adam(schedule(config.learning_rate, config.ray_learning_rate, config.frozen_steps)),
+        "recognition": optax.adam(schedule(config.learning_rate, config.ray_learning_rate)),
         "encoder": optax.adam(schedule(config.learning_rate, config.learning_rate)),  # idle in the solid phase
     }
     return optax.chain(optax.clip_by_global_norm(200.0), optax.multi_transform(rates, labels))

@@ -35,7 +35,7 @@ class Trainer:
     def __call__(
         self, model: Any, solids: Solids, views: ViewSet, likelihood: Any, config: TrainConfig, folder: Path
     ) -> Iterator:
-        self.asked = {"solids": solids, "views": views, "config": config, "likelihood": likelihood}
+        self.asked = {"model": model, "solids": solids, "views": views, "config": config, "likelihood": likelihood}
         folder.mkdir(parents=True, exist_ok=True)
         for step in (config.steps // 2, config.steps):
             metrics = {"step": step, "loss": 3.0 / step, "fit": -1.0, "kl": 2.0}
@@ -73,6 +73,20 @@ def test_the_recipe_is_handed_over_and_the_weights_exported(
     assert (folder / "curves.png").stat().st_size > 1000
     said = capsys.readouterr().out
     assert str(folder / "curves.png") in said and "farside bench prior --prior" in said
+
+
+def test_training_goes_on_from_weights_of_the_same_preset(
+    tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture
+) -> None:
+    assert run(tmp_path / "a") == 0
+    weights = tmp_path / "a" / "prior.safetensors"
+    assert run(tmp_path / "b", "--start", str(weights), "--seed", "5") == 0
+    kernel = load_prior(weights).model.hyper.weight
+    assert np.array_equal(trainer.asked["model"].hyper.weight, kernel)
+    started = load_prior(tmp_path / "b" / "prior.safetensors").metadata["start"]
+    assert started["hash"] == load_prior(weights).hash and started["recipe"]["seed"] == 4
+    assert run(tmp_path / "c", "--preset", "small", "--start", str(weights)) == 1
+    assert "holds preset 'tiny', not 'small'" in capsys.readouterr().err
 
 
 def test_ctrl_c_leaves_the_curves(tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture) -> None:

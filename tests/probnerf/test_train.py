@@ -59,6 +59,16 @@ def test_a_killed_run_resumes_with_identical_results(solids: Solids, views: View
     assert [json.loads(line)["rays"] for line in lines] == [False] * 4 + [True] * 4
 
 
+def test_a_frozen_decoder_waits_for_recognition(solids: Solids, views: ViewSet, tmp_path: Path) -> None:
+    steps = train(model(), solids, views, LIKELIHOOD, replace(CONFIG, frozen_steps=2), tmp_path)
+    frozen, moved = [jax.tree.map(np.asarray, state) for state, _ in islice(steps, 4)][1::2]
+    for part in ("hyper", "flow"):
+        start = jax.tree.leaves(getattr(model(), part))
+        assert all(map(np.array_equal, jax.tree.leaves(getattr(frozen.model, part)), start))
+        assert not all(map(np.array_equal, jax.tree.leaves(getattr(moved.model, part)), start))
+    assert np.any(frozen.recognition.output.weight != moved.recognition.output.weight)
+
+
 def test_another_recipe_does_not_continue_a_run(solids: Solids, views: ViewSet, tmp_path: Path) -> None:
     run(solids, views, tmp_path, steps=4)
     other = train(model(), solids, views, LIKELIHOOD, replace(CONFIG, learning_rate=1.0), tmp_path)
