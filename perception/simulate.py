@@ -196,7 +196,8 @@ def _blobs(rng: np.random.Generator, shape: tuple[int, ...], config: SensorConfi
         row, column = rng.uniform(0, shape[0]), rng.uniform(0, shape[1])
         radius = config.blob_radius * np.exp(0.5 * rng.standard_normal())
         low = np.maximum(np.array([row, column]) - radius, 0).astype(int)
-        window = np.s_[low[0] : int(row + radius) + 1, low[1] : int(column + radius) + 1]
+        high = np.minimum(np.array([row, column]) + radius + 1, shape).astype(int)
+        window = np.s_[low[0] : high[0], low[1] : high[1]]
         y, x = np.mgrid[window]
         lost[window] |= (y - row) ** 2 + (x - column) ** 2 < radius**2
     return lost

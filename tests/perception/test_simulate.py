@@ -63,6 +63,16 @@ def test_noise_has_the_stated_size() -> None:
         assert np.allclose(depth[np.isfinite(depth)] * 1000, np.rint(depth[np.isfinite(depth)] * 1000), atol=1e-3)
 
 
+def test_blobs_may_reach_over_every_border() -> None:
+    """A blob may be wider than the picture, and may have its middle at any edge."""
+    camera = Camera(24, 12, np.array([[20.0, 0, 12], [0, 20.0, 6], [0, 0, 1]]), np.zeros(5))
+    flat = np.full((12, 24), 0.5)
+    plane = Picture(np.zeros((12, 24, 3)), flat, flat, flat, np.zeros((12, 24), np.int32))
+    many = SensorConfig(blobs=0.1, blob_radius=8.0)
+    lost = [np.isnan(sense(plane, camera, None, seed=s, config=many).depth).mean() for s in range(20)]
+    assert min(lost) > 0.5
+
+
 def test_depth_fails_at_edges_and_in_the_stereo_shadow(picture: Picture) -> None:
     frame = sense(picture, CAMERA, T_WORLD_CAMERA, seed=1)
     lost = np.isnan(frame.depth)
