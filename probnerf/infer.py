@@ -49,6 +49,7 @@ class InferConfig:
     extent: float = 1.1  # the lattice covers [-extent, extent]^3: an object may be larger than its guessed cube
     colour_sigma: float = 0.1  # s
     wall_sigma: float = 0.02  # cube units: floor of the model's own error in a wall's place
+    power: float = 1.0  # of the likelihood: below 1 where pixels' misfits are not independent
     encoder_starts: bool = True  # propose starts by the encoder, in a defensive mixture with the prior
     sample_delta: bool = False  # also infer the weights' perturbation delta
 
@@ -62,6 +63,7 @@ def likelihood_of(config: InferConfig, observation: Observation, sample_pose: bo
         lattice=replace_crossings(lattice, padded),
         colour_sigma=config.colour_sigma,
         wall_sigma=config.wall_sigma,
+        power=config.power,
         sample_pose=sample_pose,
         sample_delta=config.sample_delta,
     )

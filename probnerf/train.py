@@ -219,9 +219,13 @@ def optimiser_of(config: TrainConfig) -> optax.GradientTransformation:
         ]
         return optax.join_schedules([optax.constant_schedule(0.0), *parts], [still, first])
 
+    def named(name: str, network: Any) -> Any:
+        return jax.tree.map(lambda _: name, network)
+
     def labels(networks: tuple[ProbNeRF, Recognition]) -> tuple[ProbNeRF, Recognition]:
-        model, recognition = (jax.tree.map(lambda _: name, n) for name, n in zip(rates, networks, strict=False))
-        return eqx.tree_at(lambda m: m.encoder, model, jax.tree.map(lambda _: "encoder", model.encoder)), recognition
+        model, recognition = networks
+        decoder = eqx.tree_at(lambda m: m.encoder, named("decoder", model), named("encoder", model.encoder))
+        return decoder, named("recognition", recognition)
 
     rates = {
         "decoder": optax.adam(schedule(config.learning_rate, config.ray_learning_rate, config.frozen_steps)),
