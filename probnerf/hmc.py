@@ -29,8 +29,6 @@ from probnerf.types import Diagnostics, Posterior
 # (args, q [p, d]) -> log-likelihood [p]; differentiable, rows independent. It is a static argument of the compiled
 # functions: pass the same function object again (not a new lambda) and only `args` may change without compiling.
 LogLikelihood = Callable[[Any, Float[Array, "p d"]], Float[Array, "p"]]
-# (key, positions) -> positions: a symmetric proposal that keeps the density N(0, I), such as a random rotation.
-Turn = Callable[[PRNGKeyArray, Float[Array, "... d"]], Float[Array, "... d"]]
 
 MAX_ENERGY_ERROR = 1000.0  # nats; beyond it a trajectory counts as divergent
 JITTER = (0.8, 1.2)  # random factor of the step size, so that no trajectory length is a multiple of a period
@@ -192,17 +190,6 @@ def hmc_step(
         lambda a, b: jnp.where(accepted.reshape(chains + (1,) * (a.ndim - len(chains))), a, b), end, state
     )
     return state, HMCInfo(acceptance, accepted, divergent, error)
-
-
-def metropolis_step(key: PRNGKeyArray, state: HMCState, target: Target, turn: Turn) -> HMCState:
-    """One Metropolis step of every chain along `turn`: prior and proposal cancel, the tempered likelihoods decide."""
-    propose_key, accept_key = jax.random.split(key)
-    proposal = target.evaluate(turn(propose_key, state.position))
-    ratio = target.beta * (proposal.log_likelihood - state.log_likelihood)  # NaN, where both are dead, stays
-    accept = jnp.log(jax.random.uniform(accept_key, ratio.shape)) < ratio
-    return jax.tree.map(
-        lambda a, b: jnp.where(accept.reshape(accept.shape + (1,) * (a.ndim - accept.ndim)), a, b), proposal, state
-    )
 
 
 def split_r_hat(draws: Float[np.ndarray, "chains n"]) -> float:

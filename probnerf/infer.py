@@ -29,7 +29,6 @@ from probnerf.smc import TemperedSMCConfig, tempered_smc
 from probnerf.types import OBJECT, UNKNOWN, Observation, Pose, Posterior
 
 Method = Literal["tempered_smc", "annealed_hmc"]
-SMALL_TURN = 0.3  # radians
 
 
 def quick_smc() -> TemperedSMCConfig:
@@ -51,7 +50,6 @@ class InferConfig:
     colour_sigma: float = 0.1  # s
     wall_sigma: float = 0.02  # cube units: floor of the model's own error in a wall's place
     power: float = 1.0  # of the likelihood: below 1 where pixels' misfits are not independent
-    turns: bool = True  # tempered SMC also tries other yaws of the same shape after each HMC iteration
     encoder_starts: bool = True  # propose starts by the encoder, in a defensive mixture with the prior
     sample_delta: bool = False  # also infer the weights' perturbation delta
 
@@ -115,35 +113,9 @@ def infer(
             config.smc.start_particles,
         )
     posterior = tempered_smc(
-        key,
-        log_likelihood,
-        args,
-        dim,
-        config.smc,
-        initial=initial,
-        turn=TurnYaw(model.latent) if sample_pose and config.turns else None,
-        on_stage=on_stage,
-        deadline=deadline,
-        stages=stages,
+        key, log_likelihood, args, dim, config.smc, initial=initial, on_stage=on_stage, deadline=deadline, stages=stages
     )
     return posterior, likelihood
-
-
-@dataclass(frozen=True)
-class TurnYaw:
-    """Proposes other yaws: turns (a, b) by a wide angle or by a small one, with equal chance. z~ stays as it is."""
-
-    latent: int  # K, where the pose's latents begin
-
-    def __call__(self, key: Array, positions: Float[Array, "... d"]) -> Float[Array, "... d"]:
-        k0, k1, k2 = jax.random.split(key, 3)
-        shape = positions.shape[:-1]
-        small = SMALL_TURN * jax.random.normal(k0, shape)
-        wide = jax.random.uniform(k1, shape, minval=-jnp.pi, maxval=jnp.pi)
-        angle = jnp.where(jax.random.bernoulli(k2, 0.5, shape), small, wide)
-        a, b = positions[..., self.latent], positions[..., self.latent + 1]
-        c, s = jnp.cos(angle), jnp.sin(angle)
-        return positions.at[..., self.latent].set(c * a - s * b).at[..., self.latent + 1].set(s * a + c * b)
 
 
 def thin(posterior: Posterior, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

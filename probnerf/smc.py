@@ -6,9 +6,6 @@ move is wasted: waste-free SMC, Dau and Chopin 2022). Then beta takes the longes
 size of the pool under the weights L^(step) (conditional ESS, Zhou, Johansen and Aston 2016), and systematic resampling
 draws the next particles from it. The product of the mean weights estimates the evidence.
 
-Where the caller knows a symmetry of the prior (`turn`), each HMC iteration is followed by a Metropolis step along it:
-modes that no gradient joins, such as the yaws that would hide a handle, exchange particles.
-
 What tunes one population's moves (metric, step size) is read off its neighbour, never off the states about to move.
 """
 
@@ -25,19 +22,7 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from probnerf.hmc import (
-    HMCState,
-    LogLikelihood,
-    Metric,
-    StageInfo,
-    Target,
-    Turn,
-    gradient_metric,
-    hmc_step,
-    metropolis_step,
-    split_r_hat,
-)
-from probnerf.resample import choose, next_beta
+from probnerf.hmc import HMCState, LogLikelihood, Metric, StageInfo, Target, gradient_metric, hmc_step, split_r_hat
 from probnerf.types import Diagnostics, Posterior
 
 
@@ -100,6 +85,50 @@ def log_prior(q: Float[Array, "... d"]) -> Float[Array, "..."]:
     return -0.5 * jnp.sum(q * q + jnp.log(2 * jnp.pi), axis=-1)
 
 
+# Fractions of the remaining way to beta = 1, 40 a decade. A grid, as the ESS need not fall with beta under proposals.
+_FRACTIONS = np.geomspace(1e-9, 1.0, 361).astype(np.float32)
+
+
+def _ess(log_w: Float[Array, "n"]) -> Float[Array, ""]:
+    top = jnp.max(log_w)
+    w = jnp.exp(log_w - jnp.where(jnp.isfinite(top), top, 0.0))
+    return jnp.sum(w) ** 2 / jnp.maximum(jnp.sum(w * w), 1e-30)  # 0 if all weights are
+
+
+def _next_beta(beta, log_w, log_likelihood, enough):
+    """The largest beta at which the weights exp(log_w) L^step have ESS `enough`; their logarithms; their ESS.
+
+    Where none has (dead particles, poor proposals), the beta of the largest ESS; with no live particle at all, 1.
+    """
+
+    def weights(step):
+        return jnp.where(jnp.isfinite(log_likelihood), log_w + step * log_likelihood, -jnp.inf)
+
+    steps = (1.0 - beta) * _FRACTIONS
+    ess = jax.vmap(lambda step: _ess(weights(step)))(steps)
+    last = ess.size - 1
+    index = jnp.where(jnp.any(ess >= enough), last - jnp.argmax((ess >= enough)[::-1]), jnp.argmax(ess))
+    index = jnp.where(jnp.any(jnp.isfinite(log_likelihood)), index, last)
+    new = jnp.where(index == last, 1.0, beta + steps[index])  # in float32 beta + (1 - beta) need not be 1
+    return new, weights(new - beta), ess[index]
+
+
+def _resample(key, log_w, count: int):
+    """Systematic resampling: indices of `count` particles, each drawn count * w_i times up to rounding."""
+    top = jnp.max(log_w)
+    total = jnp.cumsum(jnp.where(jnp.isfinite(top), jnp.exp(log_w - top), 1.0))
+    u = (jnp.arange(count) + jax.random.uniform(key)) / count
+    u = jnp.minimum(u, 1.0 - 2.0**-24)  # rounding up to 1 would pass the last particle of positive weight
+    return jnp.searchsorted(total / total[-1], u, side="right")
+
+
+def _choose(key, log_w, pool, count: int):
+    """`count` particles of each population's weighted pool, resampled."""
+    keys = jax.random.split(key, log_w.shape[0])
+    index = jax.vmap(lambda k, w: _resample(k, w, count))(keys, log_w)
+    return jax.vmap(lambda tree, i: jax.tree.map(lambda a: a[i], tree))(pool, index)
+
+
 def _metrics(gradient, log_w, beta, config: TemperedSMCConfig) -> Metric:
     """Each population's metric, from the weighted pool of the population before it."""
     rank = min(config.moves * config.particles, gradient.shape[-1])
@@ -120,9 +149,9 @@ def _start(key, args, q0, log_w0, *, log_likelihood: LogLikelihood, config: Temp
 
     value = jnp.where(jnp.isfinite(log_w0), pool.log_likelihood, -jnp.inf)
     enough = config.ess_target * config.particles  # a number, so that a larger start buys a longer first step
-    beta, log_w, ess = jax.vmap(lambda w, v: next_beta(jnp.zeros(()), w, v, enough))(log_w0, value)
+    beta, log_w, ess = jax.vmap(lambda w, v: _next_beta(jnp.zeros(()), w, v, enough))(log_w0, value)
     ancestor = jnp.broadcast_to(jnp.arange(count), log_w.shape)
-    chain, ancestor = choose(key, log_w, (pool, ancestor), config.particles)
+    chain, ancestor = _choose(key, log_w, (pool, ancestor), config.particles)
     state = _State(
         chain=chain,
         beta=beta,
@@ -135,18 +164,14 @@ def _start(key, args, q0, log_w0, *, log_likelihood: LogLikelihood, config: Temp
     return state, _Info(ess, jnp.full(populations, jnp.nan), state.step_size, jnp.zeros((), jnp.int32))
 
 
-@partial(jax.jit, static_argnames=("log_likelihood", "config", "turn"))
-def _stage(key, state: _State, args, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig, turn: Turn | None):
+@partial(jax.jit, static_argnames=("log_likelihood", "config"))
+def _stage(key, state: _State, args, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig):
     """`moves` iterations at the present beta, then the step to the next beta and resampling (at beta = 1: neither)."""
     target = Target(log_likelihood, args, state.beta[:, None], state.metric)
 
     def move(carry, key):
         chain, step = carry
-        if turn is not None:
-            key, turn_key = jax.random.split(key)
         chain, info = hmc_step(key, chain, target, step[:, None], config.leapfrog_steps)
-        if turn is not None:
-            chain = metropolis_step(turn_key, chain, target, turn)
         acceptance = jnp.mean(info.acceptance, axis=1)
         tuned = jnp.minimum(step * jnp.exp(2.0 * (acceptance - config.target_acceptance)), config.longest_step)
         return (chain, jnp.roll(tuned, 1)), (chain, acceptance, step, jnp.sum(info.divergent))
@@ -158,11 +183,11 @@ def _stage(key, state: _State, args, *, log_likelihood: LogLikelihood, config: T
     # [moves, m, p, ...] -> [m, moves p, ...]
     pool = jax.tree.map(lambda a: a.swapaxes(0, 1).reshape(config.populations, -1, *a.shape[3:]), pool)
     size = config.moves * config.particles
-    beta, log_w, ess = jax.vmap(lambda b, v: next_beta(b, jnp.zeros(size), v, config.ess_target * size))(
+    beta, log_w, ess = jax.vmap(lambda b, v: _next_beta(b, jnp.zeros(size), v, config.ess_target * size))(
         state.beta, pool.log_likelihood
     )
     ancestor = jnp.tile(state.ancestor, (1, config.moves))
-    chosen = choose(resample_key, log_w, (pool, ancestor), config.particles)
+    chosen = _choose(resample_key, log_w, (pool, ancestor), config.particles)
     tempering = state.beta < 1
     chain, ancestor = jax.tree.map(
         lambda a, b: jnp.where(tempering.reshape(-1, *[1] * (a.ndim - 1)), a, b), chosen, (chain, state.ancestor)
@@ -196,7 +221,6 @@ def tempered_smc(
     config: TemperedSMCConfig | None = None,
     *,
     initial: tuple[Float[Array, "m p0 d"], Float[Array, "m p0"]] | None = None,
-    turn: Turn | None = None,
     on_stage: Callable[[StageInfo], None] | None = None,
     deadline: float | None = None,
     stages: int | None = None,
@@ -204,8 +228,7 @@ def tempered_smc(
     """Samples N(q; 0, I) L(q) by adaptive tempered SMC, with an estimate of its integral, the evidence.
 
     `initial` are positions drawn from any density that covers the prior (say a defensive mixture of prior and encoder)
-    and the logarithm of that density there; None draws `start_particles` from the prior. `turn` is a symmetric proposal
-    that keeps N(0, I) (the caller's word for it), tried after each HMC iteration. `deadline` is on the clock of
+    and the logarithm of that density there; None draws `start_particles` from the prior. `deadline` is on the clock of
     time.monotonic(): no stage is begun that would pass it even if as short as the shortest so far. `stages` caps their
     number. Without a deadline the answer depends on key and stages alone. The start is always made.
 
@@ -228,7 +251,6 @@ def tempered_smc(
     state, info = _start(start_key, args, q0, log_w0, log_likelihood=log_likelihood, config=config)
 
     gradients = float(q0.shape[0] * q0.shape[1])
-    evaluations = config.leapfrog_steps + (turn is not None)
     kept: list[HMCState] = []  # the pools of the final stages
     cap = config.max_stages if stages is None else min(stages, config.max_stages)
     done, divergences, shortest, acceptance, result = 0, 0, 0.0, float("nan"), "converged"
@@ -245,7 +267,7 @@ def tempered_smc(
                 break
             final = bool(np.all(np.asarray(state.beta) == 1.0))
             state, info, pool = _stage(
-                jax.random.fold_in(key, done), state, args, log_likelihood=log_likelihood, config=config, turn=turn
+                jax.random.fold_in(key, done), state, args, log_likelihood=log_likelihood, config=config
             )
             acceptance = float(np.mean(np.asarray(info.acceptance)))  # waits for the device
             if final:
@@ -253,7 +275,7 @@ def tempered_smc(
             done += 1
             seconds = time.monotonic() - now
             shortest = seconds if done == 1 else min(shortest, seconds)
-            gradients += config.populations * config.particles * config.moves * evaluations
+            gradients += config.populations * config.particles * config.moves * config.leapfrog_steps
     except KeyboardInterrupt:
         result = "interrupted"
     return _posterior(state, kept[-config.keep :] or [state.chain], acceptance, divergences, done, gradients, result)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from probnerf.hmc import StageInfo
-from probnerf.resample import next_beta, systematic
-from probnerf.smc import TemperedSMCConfig, log_prior, tempered_smc
+from probnerf.smc import TemperedSMCConfig, _next_beta, _resample, log_prior, tempered_smc
 from probnerf.types import Posterior
 
 CONFIG = TemperedSMCConfig(populations=4, particles=32, start_particles=128)
@@ -115,29 +114,6 @@ def test_two_separate_modes_get_their_weights():
     assert np.all(within > 0.98)
     ratios = np.exp([float(run.log_evidence) - evidence for run in runs])
     assert abs(ratios.mean() - 1) < 3 * ratios.std(ddof=1) / 4
-
-
-def opposite(key, q):
-    """The mirror of the first coordinate, or no change: keeps N(0, I), and its own inverse."""
-    return q.at[..., 0].multiply(jnp.where(jax.random.bernoulli(key, 0.5, q.shape[:-1]), -1.0, 1.0))
-
-
-def test_a_turn_reaches_modes_that_no_particle_started_in():
-    """All particles start in the lighter mode. Without the turn the heavier one stays empty."""
-    args, _ = two_modes(0.7)
-    start = jax.random.normal(jax.random.key(3), (CONFIG.populations, CONFIG.particles, DIM))
-    start = start.at[..., 0].set(-jnp.abs(start[..., 0]))
-    initial = start, log_prior(start) + np.log(2.0)
-
-    def shares(turn):
-        runs = [
-            tempered_smc(jax.random.key(s), mixture, args, DIM, CONFIG, initial=initial, turn=turn) for s in range(4)
-        ]
-        return np.array([weighted(run, run.positions[:, 0] > 0) for run in runs])
-
-    assert shares(None).max() < 0.35
-    found = shares(opposite)
-    assert abs(found.mean() - 0.7) < 0.05
 
 
 def defensive(key, mean, scale: float, count: int):
@@ -247,7 +223,7 @@ def test_systematic_resampling_copies_each_particle_its_due():
     for seed in range(20):
         log_w = np.where(rng.random(100) < 0.3, -np.inf, 3 * rng.normal(size=100))
         w = np.exp(log_w) / np.exp(log_w).sum()
-        counts = np.bincount(systematic(jax.random.key(seed), jnp.asarray(log_w, jnp.float32), 64), minlength=100)
+        counts = np.bincount(_resample(jax.random.key(seed), jnp.asarray(log_w, jnp.float32), 64), minlength=100)
         assert counts.sum() == 64
         assert np.all(np.abs(counts - 64 * w) < 1 + 1e-4)
         assert np.all(counts[w == 0] == 0)
@@ -256,13 +232,13 @@ def test_systematic_resampling_copies_each_particle_its_due():
 def test_the_step_of_beta():
     value = jnp.asarray(np.random.default_rng(1).normal(size=256) * 100, jnp.float32)
     flat = jnp.zeros(256)
-    beta, log_w, ess = next_beta(jnp.float32(0.2), flat, value, 128.0)
+    beta, log_w, ess = _next_beta(jnp.float32(0.2), flat, value, 128.0)
     assert 128 <= float(ess) < 140
     np.testing.assert_allclose(log_w, (beta - 0.2) * value, rtol=1e-3)
-    assert float(next_beta(jnp.float32(0.2), flat, value / 1e4, 128.0)[0]) == 1.0
+    assert float(_next_beta(jnp.float32(0.2), flat, value / 1e4, 128.0)[0]) == 1.0
     # Most particles dead: the live ones are kept, and beta moves as little as it can.
     dead = jnp.where(jnp.arange(256) < 200, -jnp.inf, value)
-    beta, log_w, ess = next_beta(jnp.float32(0.0), flat, dead, 128.0)
+    beta, log_w, ess = _next_beta(jnp.float32(0.0), flat, dead, 128.0)
     assert 0 < float(beta) < 1e-6
     assert float(ess) == pytest.approx(56.0)
     assert np.all(np.isneginf(log_w[:200]))
