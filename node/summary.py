@@ -8,6 +8,7 @@ from probnerf.occupancy import voxel_centres
 from probnerf.types import BASE_Z
 
 CM3 = 1e6  # per cubic metre
+R_HAT = 1.1  # above it chains have not mixed (Gelman et al., BDA3, section 11.4)
 
 
 def hidden_volume(h: Hypotheses) -> tuple[float, Float[np.ndarray, "3"]]:
@@ -44,6 +45,8 @@ def warnings(h: Hypotheses) -> list[str]:
         out.append("out of model: no shape of the prior explains this view; its answers are cautious")
     if not h.inside_view:
         out.append("the picture's border cuts the object off")
+    if (r_hat := h.diagnostics.get("r_hat", np.nan)) > R_HAT:
+        out.append(f"the sampler's populations disagree (R-hat {r_hat:.2f}): other shapes may fit too")
     if h.diagnostics.get("divergences", 0.0) > 0:
         out.append(f"{h.diagnostics['divergences']:.0f} divergent trajectories")
     return out

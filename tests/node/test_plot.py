@@ -122,4 +122,6 @@ def test_the_short_table_tells_the_unseen(mug: Hypotheses) -> None:
     assert rows["hypotheses"].startswith("4 (2.7") and "cm³" in rows["solid in it"]
     assert figures(replace(mug, diagnostics={"log_evidence": float("nan")}))["log evidence"] == "none"
     assert not warnings(mug)
-    assert len(warnings(replace(mug, out_of_model=True, inside_view=False, diagnostics={"divergences": 2.0}))) == 3
+    bad = {"divergences": 2.0, "r_hat": 1.3}
+    assert len(warnings(replace(mug, out_of_model=True, inside_view=False, diagnostics=bad))) == 4
+    assert not warnings(replace(mug, diagnostics={"r_hat": 1.05}))
