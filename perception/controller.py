@@ -108,6 +108,7 @@ def estimate(
             "log_evidence_se": float(posterior.log_evidence_se),
             "point_gradients": float(d.point_gradients) * likelihood.lattice.crossings * observation.status.shape[0],
             "explained": fit,
+            "power": likelihood.power,
         },
         result=posterior.result,
     )

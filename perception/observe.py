@@ -23,9 +23,9 @@ NO_LIMIT = 1e3  # cube units: a ray that misses the object without an end
 class ObserveConfig:
     """How a segment becomes an Observation. Ray counts are fixed, so that no frame compiles anew."""
 
-    colour_rays: int = 64  # OBJECT pixels
-    free_rays: int = 52  # FREE pixels, half of them near the outline
-    occluder_rays: int = 12  # UNKNOWN pixels that see something nearer
+    colour_rays: int = 32  # OBJECT pixels
+    free_rays: int = 26  # FREE pixels, half of them near the outline
+    occluder_rays: int = 6  # UNKNOWN pixels that see something nearer
     range_sigma_a: float = 1.0e-3  # m; sigma of a range d: a + b d^2
     range_sigma_b: float = 2.0e-3  # 1/m
     cube: float = 1.2  # half side (cube units) of the box that a ray must meet to be worth asking

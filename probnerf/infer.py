@@ -33,8 +33,9 @@ Method = Literal["tempered_smc", "annealed_hmc"]
 
 def quick_smc() -> TemperedSMCConfig:
     """A population that two CPU cores move in seconds; `TemperedSMCConfig()` is the one that the laws are tested on."""
+    # many particles and one short move: few particles all descend from one or two starts, and lose the other modes
     return TemperedSMCConfig(
-        particles=16, start_particles=192, moves=3, leapfrog_steps=4, ess_target=0.4, final_stages=1, keep=1
+        particles=96, start_particles=384, moves=1, leapfrog_steps=3, ess_target=0.4, final_stages=1, keep=1
     )
 
 
@@ -47,9 +48,9 @@ class InferConfig:
     hmc: AnnealedHMCConfig = field(default_factory=AnnealedHMCConfig)
     lattice: int = 32  # G: cubes per 2 units
     extent: float = 1.1  # the lattice covers [-extent, extent]^3: an object may be larger than its guessed cube
-    colour_sigma: float = 0.1  # s
+    colour_sigma: float = 0.15  # s: what the prior cannot draw of a print or a band, too
     wall_sigma: float = 0.02  # cube units: floor of the model's own error in a wall's place
-    power: float = 1.0  # of the likelihood: below 1 where pixels' misfits are not independent
+    power: float = 0.5  # kappa: pixels' misfits are not independent, so that each counts as less than one
     encoder_starts: bool = True  # propose starts by the encoder, in a defensive mixture with the prior
     sample_delta: bool = False  # also infer the weights' perturbation delta
 
