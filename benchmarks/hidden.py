@@ -217,7 +217,7 @@ def _draw(judged: Sequence[Judged], path: Path) -> None:
     ranks.hist(np.concatenate([j.ranks[POSTERIOR] for j in judged]), np.linspace(0, 1, 11), color=COLOURS[POSTERIOR])
     ranks.axhline(BOXES * len(judged) / 10, color="k", linestyle="--", linewidth=1)
     ranks.set(
-        xlabel="randomised rank of a box's volume (flat: calibrated)", ylabel="boxes", title="ranks of the posterior"
+        xlabel="rank of a box's volume (flat: calibrated)", ylabel="boxes", title="ranks of the posterior"
     )
 
     axes = bottom.subplots(min(3, len(judged)), 2 + len(METHODS), squeeze=False)
