@@ -216,9 +216,7 @@ def _draw(judged: Sequence[Judged], path: Path) -> None:
     _draw_reliability(judged, reliability)
     ranks.hist(np.concatenate([j.ranks[POSTERIOR] for j in judged]), np.linspace(0, 1, 11), color=COLOURS[POSTERIOR])
     ranks.axhline(BOXES * len(judged) / 10, color="k", linestyle="--", linewidth=1)
-    ranks.set(
-        xlabel="rank of a box's volume (flat: calibrated)", ylabel="boxes", title="ranks of the posterior"
-    )
+    ranks.set(xlabel="rank of a box's volume (flat: calibrated)", ylabel="boxes", title="ranks of the posterior")
 
     axes = bottom.subplots(min(3, len(judged)), 2 + len(METHODS), squeeze=False)
     for row, j in zip(axes, judged, strict=False):
