@@ -196,7 +196,7 @@ def main(
         raise FileNotFoundError(f"{data}: no frame with true models there; give its folder with --data")
     loaded, frame, truth = load_prior(prior), read_frame_folder(data), read_truth(data)
     judged: list[Judged] = []
-    config, sizes = ControllerConfig(), set[int]()
+    config, sizes = ControllerConfig(), set[tuple[int, ...]]()
     for labelled in (True, False):
         begun = time.monotonic()
         given = frame if labelled else replace(frame, label=None)

@@ -133,7 +133,7 @@ def main(
         budget_s = min(budget_s, 10.0)
     rate = base_rate(128 if quick else 1024, config=config.observe)
     judged: list[Judged] = []
-    sizes: set[int] = set()
+    sizes: set[tuple[int, ...]] = set()
     for family_seed in TEST_SEEDS:
         if len(judged) == n:
             break

@@ -167,7 +167,7 @@ def _batches(seen: SeenObject, config: GateConfig) -> Observation:
         range_sigma=jnp.full(shape, config.range_sigma),
         range_valid=jnp.asarray(hit),
         limit=jnp.asarray(np.where(hit, 0.0, foam.FAR), jnp.float32),
-        pose_sigma=jnp.zeros((steps, 4)),
+        pose_sigma=jnp.zeros((steps, 5)),
         colour_count=counts[0],
     )
 
@@ -222,7 +222,7 @@ def rebuild(model: ProbNeRF, seed: int, config: GateConfig) -> Rebuilt:
     rendered = render_pixels(model, z[0], seen, np.concatenate(boxes), config)
     parts = np.split(rendered, np.cumsum([len(b) for b in boxes])[:-1])
     truth = seen.rgb.reshape(-1, 3)
-    occupied = solid(np.asarray(opacity_grids(model, config.likelihood, z, jnp.zeros(4), grid=GRID))[0])
+    occupied = solid(np.asarray(opacity_grids(model, config.likelihood, z, jnp.zeros(5), grid=GRID))[0])
     true_solid = solid(np.asarray(solid_occupancy(seen.truth, GRID), np.float32))
     return Rebuilt(
         seen=seen,

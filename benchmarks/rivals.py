@@ -85,10 +85,13 @@ def answers(
     return result
 
 
-def warm_up(frame: Frame, segment: Segment, prior: Prior, config: ControllerConfig, sizes: set[int]) -> None:
+def warm_up(
+    frame: Frame, segment: Segment, prior: Prior, config: ControllerConfig, sizes: set[tuple[int, ...]]
+) -> None:
     """Compile what this view needs, once for each of the `sizes` it comes in, so that no budget pays for it."""
     observation, _ = observe(frame, segment, config.observe)
-    size = likelihood_of(config.infer, observation).lattice.crossings
+    likelihood = likelihood_of(config.infer, observation)
+    size = (likelihood.lattice.crossings, *likelihood.packed)
     if size not in sizes:
         estimate(frame, segment, prior, config, stages=1)
         sizes.add(size)
@@ -103,7 +106,7 @@ def encoder_alone(
     draws: within a yaw the encoder is taken at its word. x, y and scale are perception's guess.
     """
     positions = encoder_positions(key, model, picture, config.yaws, config.draws, 1.0)
-    args = (model, likelihood, observation, faces_of_view(observation, likelihood.lattice))
+    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
     values = np.asarray(jax.jit(log_likelihood)(args, positions), np.float64).reshape(config.yaws, config.draws)
     values = np.where(np.isfinite(values), values, -np.inf)
     each = np.exp(values - values.max()).mean(axis=1)
@@ -126,7 +129,7 @@ def _encoder_positions(
     zero = jnp.zeros(())
 
     def at(yaw: Array, noise: Array) -> Array:
-        mean, precision = potential_at(model, picture, Pose(yaw, zero, zero, zero), 1.0)
+        mean, precision = potential_at(model, picture, Pose(yaw, zero, zero, zero, zero), 1.0)
         z = mean + spread * noise / jnp.sqrt(precision)
         z_tilde = jax.vmap(lambda one: model.flow.inverse(one)[0])(z)
         pose = jnp.zeros((len(noise), POSE_SIZE)).at[:, 0].set(jnp.cos(yaw)).at[:, 1].set(jnp.sin(yaw))

@@ -211,7 +211,7 @@ def base_rate(objects: int = 1024, grid: int = GRID, config: ObserveConfig | Non
     rng = np.random.default_rng(29)
     yaw, spread = rng.uniform(-np.pi, np.pi, objects), rng.standard_normal((3, objects))
     x, y, log_scale = spread * np.array([[config.xy_sigma], [config.xy_sigma], [config.log_scale_sigma]])
-    poses = Pose(*(jnp.asarray(a, jnp.float32) for a in (yaw, x, y, log_scale)))
+    poses = Pose(*(jnp.asarray(a, jnp.float32) for a in (yaw, x, y, log_scale, np.zeros(objects))))
     rate = np.asarray(_frequency(sample_objects(TRAIN_SEEDS[:objects]), poses, grid), np.float64)
     turned = [np.rot90(r, k) for r in (rate, rate[:, ::-1]) for k in range(4)]
     return np.mean(turned, axis=0)

@@ -6,8 +6,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from perception.hypotheses import FrameName, load_scene
+from perception.hypotheses import FrameName
 from perception.query import Box, Points, QueryResult, query
+from perception.store import load_scene
 
 CM3 = 1e6  # per cubic metre
 

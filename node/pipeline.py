@@ -14,9 +14,10 @@ from rich.table import Table
 from node.plot import draw_object
 from node.summary import figures, warnings
 from perception.controller import ControllerConfig, Estimate, estimate
-from perception.hypotheses import Hypotheses, hypotheses_path, load, load_scene, save
+from perception.hypotheses import Hypotheses
 from perception.segment import Segment, SegmentConfig, segment
 from perception.source import SHIPPED_LOG, Frame, open_source
+from perception.store import hypotheses_path, load, load_scene, save
 from probnerf.hmc import StageInfo
 from probnerf.infer import Method
 from probnerf.store import Prior, load_prior

@@ -33,6 +33,7 @@ class ObserveConfig:
     xy_sigma: float = 0.08  # cube units; prior width of the body's axis about the guess
     log_scale_sigma: float = 0.06
     range_offset_sigma: float = 0.005  # m; bias that all ranges of a view share
+    plane_sigma: float = 0.005  # m; of the plane's height, which a sensor measures at a grazing angle
     hidden_sigma: float = 0.3  # added to all widths, times the share of the outline that is hidden or cut off
     side_sigma: float = 0.08  # added to all widths where the camera does not look down on the top
     rim_reach: float = 0.02  # m; a rim pixel this near its neighbour inside the outline is of the object
@@ -129,7 +130,13 @@ def observe(
         range_valid=jnp.asarray(measured & (kind == OBJECT)),
         limit=jnp.asarray(limit, jnp.float32),
         pose_sigma=jnp.asarray(
-            [cube.xy_sigma, cube.xy_sigma, cube.log_scale_sigma, config.range_offset_sigma / cube.half_extent],
+            [
+                cube.xy_sigma,
+                cube.xy_sigma,
+                cube.log_scale_sigma,
+                config.range_offset_sigma / cube.half_extent,
+                config.plane_sigma / cube.half_extent,
+            ],
             jnp.float32,
         ),
         colour_count=config.colour_rays,

@@ -61,7 +61,7 @@ def draw_pixels(
     """
     n = rays.origin.shape[0]
     keys = jax.random.split(key, 6)
-    pose_sigma = jnp.zeros(4)
+    pose_sigma = jnp.zeros(5)
     weights, pose = split_position(model, likelihood, position, pose_sigma)
     picture = foam.render(model.field, weights, rays, likelihood.lattice, pose)
     end = jax.random.categorical(
@@ -121,7 +121,7 @@ def scene(condition: str, depth: bool, seed: int = 0, columns: int = 12, rows: i
     key = jax.random.key(seed)
     observation = draw_pixels(key, model, likelihood, position, rays, known, jnp.asarray(depth))
     observation = object_first(observation, 2 * columns * rows // 3)
-    return model, likelihood, observation, faces_of_view(observation, likelihood.lattice)
+    return model, likelihood, observation, faces_of_view(observation, likelihood)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ class Lattice(eqx.Module):
     cubes: int = eqx.field(static=True)  # G: cubes per 2 units
     extent: float = eqx.field(static=True, default=1.0)  # the lattice covers [-extent, extent]^3
     max_crossings: int = eqx.field(static=True, default=0)  # padded crossings per ray; 0: all that a ray can have
+    below: float = eqx.field(static=True, default=0.0)  # how far under BASE_Z it reaches: an object may stand lower
 
     @property
     def planes(self) -> int:
@@ -40,7 +41,7 @@ class Lattice(eqx.Module):
 def crossings(rays: Rays, lattice: Lattice, shift: Float[Array, "3"] | float = 0.0) -> Float[Array, "n m"]:
     """Sorted distances at which each ray crosses a face inside the lattice; missing ones are FAR.
 
-    `shift` moves the faces (cube units). Nothing stands below the support plane, so crossings there are dropped too.
+    `shift` moves the faces (cube units). What is farther than `below` under the support plane is dropped too.
     """
     offsets = (jnp.arange(lattice.planes) - (lattice.planes - 1) / 2) * (2.0 / lattice.cubes)
     faces = offsets[None, :] + jnp.broadcast_to(jnp.asarray(shift), (3,))[:, None]  # [3, planes]
@@ -50,7 +51,7 @@ def crossings(rays: Rays, lattice: Lattice, shift: Float[Array, "3"] | float = 0
     points = rays.origin[:, None, None, :] + t[..., None] * direction[:, None, None, :]
     # across its own axis a crossing is on its face exactly: rounding must not push it off the outermost one
     points = jnp.where(jnp.eye(3, dtype=bool)[None, :, None, :], faces[None, :, :, None], points)
-    low = jnp.array([-lattice.extent, -lattice.extent, BASE_Z]) - 1e-6
+    low = jnp.array([-lattice.extent, -lattice.extent, BASE_Z - lattice.below]) - 1e-6
     inside = jnp.all((points >= low) & (points <= lattice.extent + 1e-6), axis=-1) & (t > 0)
     t = jnp.where(inside, t, FAR).reshape(t.shape[0], -1)
     return jnp.sort(t, axis=-1)[:, : lattice.crossings]

@@ -35,7 +35,15 @@ def quick_smc() -> TemperedSMCConfig:
     """A population that two CPU cores move in seconds; `TemperedSMCConfig()` is the one that the laws are tested on."""
     # many particles and one short move: few particles all descend from one or two starts, and lose the other modes
     return TemperedSMCConfig(
-        particles=96, start_particles=384, moves=1, leapfrog_steps=3, ess_target=0.4, final_stages=1, keep=1
+        populations=4,
+        particles=96,
+        start_particles=384,
+        moves=1,
+        leapfrog_steps=3,
+        ess_target=0.4,
+        final_stages=1,
+        keep=1,
+        evidence_power=0.5,
     )
 
 
@@ -48,31 +56,37 @@ class InferConfig:
     hmc: AnnealedHMCConfig = field(default_factory=AnnealedHMCConfig)
     lattice: int = 32  # G: cubes per 2 units
     extent: float = 1.1  # the lattice covers [-extent, extent]^3: an object may be larger than its guessed cube
-    colour_sigma: float = 0.15  # s: what the prior cannot draw of a print or a band, too
-    wall_sigma: float = 0.02  # cube units: floor of the model's own error in a wall's place
+    below: float = 0.15  # and so much under the plane, for its height is uncertain
+    colour_sigma: float = 0.3  # s: what the prior cannot draw of a print or a band, too
+    wall_sigma: float = 0.05  # cube units: the model's own error in a wall's place; wide, so that small misfits cost
+    outlier: float = 0.01  # little beside a wall where there is none: share of ranges from nowhere
+    reach: float = 0.3  # cube units behind a measured range beyond which nothing is asked
     power: float = 0.5  # kappa: pixels' misfits are not independent, so that each counts as less than one
     encoder_starts: bool = True  # propose starts by the encoder, in a defensive mixture with the prior
     sample_delta: bool = False  # also infer the weights' perturbation delta
 
 
 def likelihood_of(config: InferConfig, observation: Observation, sample_pose: bool = True) -> Likelihood:
-    """The likelihood's settings for one view; crossings are padded to a multiple of 16, so that few sizes compile."""
-    lattice = foam.Lattice(config.lattice, config.extent)
-    most = foam.count_crossings(observation.rays, lattice)
-    padded = min(16 * max(1, math.ceil(most / 16)), 3 * lattice.planes)
-    return Likelihood(
-        lattice=replace_crossings(lattice, padded),
+    """The likelihood's settings for one view; its sizes are padded, so that few of them compile."""
+    lattice = foam.Lattice(config.lattice, config.extent, below=config.below)
+    likelihood = Likelihood(
+        lattice=lattice,
         colour_sigma=config.colour_sigma,
         wall_sigma=config.wall_sigma,
+        outlier=config.outlier,
+        reach=config.reach,
         power=config.power,
         sample_pose=sample_pose,
         sample_delta=config.sample_delta,
     )
+    each = np.sum(np.asarray(faces_of_view(observation, likelihood)) < foam.FAR, axis=1)
 
+    def padded(count: int, step: int) -> int:
+        return step * max(1, math.ceil(count / step))
 
-def replace_crossings(lattice: foam.Lattice, crossings: int) -> foam.Lattice:
-    """The same lattice, keeping the first `crossings` of each ray."""
-    return foam.Lattice(lattice.cubes, lattice.extent, crossings)
+    most = min(padded(each.max(), 32), 3 * lattice.planes)
+    packed = (padded(each[: observation.colour_count].sum(), 256), padded(each.sum(), 512))
+    return replace(likelihood, lattice=replace(lattice, max_crossings=most), packed=packed)
 
 
 def infer(
@@ -94,7 +108,7 @@ def infer(
     """
     config = config or InferConfig()
     likelihood = likelihood_of(config, observation, sample_pose)
-    args = (model, likelihood, observation, faces_of_view(observation, likelihood.lattice))
+    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
     dim = likelihood.dim(model)
     if config.method == "annealed_hmc":
         hmc = (
@@ -144,7 +158,7 @@ def thin(posterior: Posterior, count: int) -> tuple[np.ndarray, np.ndarray, np.n
 
 @partial(jax.jit, static_argnames=("grid",))
 def opacity_grids(
-    model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "4"], *, grid: int
+    model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "5"], *, grid: int
 ) -> UInt8[Array, "s g g g"]:
     """round(255 x opacity across a voxel) of each position's shape on [-1, 1]^3 of the view frame.
 
@@ -166,11 +180,11 @@ def opacity_grids(
     return jax.lax.map(one, positions)
 
 
-def poses(model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "4"]) -> Pose:
+def poses(model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "5"]) -> Pose:
     """Pose of each position (identity where the pose was known)."""
     if not likelihood.sample_pose:
         zeros = jnp.zeros(positions.shape[0])
-        return Pose(zeros, zeros, zeros, zeros)
+        return Pose(*[zeros] * 5)
     k = model.latent
     return pose_of(positions[:, k : k + POSE_SIZE], pose_sigma)
 
@@ -183,7 +197,7 @@ def explained(
 
     A range is explained within 3 standard deviations (sensor, wall and face spacing) or 0.06 cube units.
     """
-    t = faces_of_view(observation, likelihood.lattice)
+    t = faces_of_view(observation, likelihood)
     status = observation.status
     tells = (status != UNKNOWN) | (observation.limit > 0)
 

@@ -1,10 +1,11 @@
 """log p(observation | position): what camera pixels say, and the position vector that samplers move.
 
-A position is a flat vector [z~ (K) | a, b, x, y, log-scale, range offset (6, if the pose is unknown) | delta (D, if
+A position is a flat vector [z~ (K) | a, b, x, y, log-scale, range offset, z (7, if the pose is unknown) | delta (D, if
 open)], each entry a priori N(0, 1), so the log prior is the same standard normal for every model and tempering is one
 multiply.
 """
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Protocol
@@ -13,13 +14,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree, Shaped
 
 from probnerf import foam
 from probnerf.field import CylinderField, Field
 from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
 
-POSE_SIZE = 6
+POSE_SIZE = 7
 
 
 class Model(Protocol):
@@ -56,6 +57,10 @@ class Likelihood(eqx.Module):
     outlier: float = eqx.field(static=True, default=0.05)  # pi: depth from nowhere, uniform over `outlier_span`
     outlier_span: float = eqx.field(static=True, default=2.5)  # cube units
     wall_sigma: float = eqx.field(static=True, default=0.02)  # floor of the model's own wall error, cube units
+    reach: float = eqx.field(
+        static=True, default=math.inf
+    )  # OBJECT: a surface so far behind the range is as good as none
+    packed: tuple[int, int] = eqx.field(static=True, default=(0, 0))  # most crossings: colour rays', all; 0: no packing
     power: float = eqx.field(static=True, default=1.0)  # kappa; other than 1 is a stated power likelihood
     sample_pose: bool = eqx.field(static=True, default=True)
     sample_delta: bool = eqx.field(static=True, default=False)
@@ -67,32 +72,36 @@ class Likelihood(eqx.Module):
         return model.latent + POSE_SIZE * self.sample_pose + weights
 
 
-def pose_of(latent: Float[Array, "6"], pose_sigma: Float[Array, "4"]) -> Pose:
-    """yaw = atan2(b, a); x, y, log-scale are standard normals times perception's widths."""
+def pose_of(latent: Float[Array, "7"], pose_sigma: Float[Array, "5"]) -> Pose:
+    """yaw = atan2(b, a); x, y, log-scale and z are standard normals times perception's widths."""
     a, b = latent[..., 0], latent[..., 1]
     # atan2 has no gradient at the origin, a point of measure zero that float32 could still meet
     at_origin = (a * a + b * b) < 1e-12
     yaw = jnp.arctan2(b, jnp.where(at_origin, 1.0, a))
     x, y, log_scale = (latent[..., 2 + i] * pose_sigma[i] for i in range(3))
-    return Pose(yaw=yaw, x=x, y=y, log_scale=log_scale)
+    return Pose(yaw=yaw, x=x, y=y, log_scale=log_scale, z=latent[..., 6] * pose_sigma[4])
 
 
 def range_offset_of(
-    model: Model, likelihood: Likelihood, position: Float[Array, "d"], pose_sigma: Float[Array, "4"]
+    model: Model, likelihood: Likelihood, position: Float[Array, "d"], pose_sigma: Float[Array, "5"]
 ) -> Float[Array, ""]:
     """What all ranges of a view have in common, cube units: a depth camera's bias, which no number of pixels averages.
 
     Without it the many pixels would place a hidden back wall confidently where the bias puts it.
     """
-    return position[model.latent + POSE_SIZE - 1] * pose_sigma[3] if likelihood.sample_pose else jnp.zeros(())
+    return position[model.latent + 5] * pose_sigma[3] if likelihood.sample_pose else jnp.zeros(())
 
 
 def split_position(
-    model: Model, likelihood: Likelihood, position: Float[Array, "d"], pose_sigma: Float[Array, "4"]
+    model: Model,
+    likelihood: Likelihood,
+    position: Float[Array, "d"],
+    pose_sigma: Float[Array, "5"],
+    decoded: Float[Array, "w"] | None = None,
 ) -> tuple[Float[Array, "w"], Pose | None]:
-    """Field weights w~ and pose of one position."""
+    """Field weights w~ and pose of one position; `decoded` is its `model.decode`, if that is known."""
     k = model.latent
-    weights = model.decode(position[:k])
+    weights = model.decode(position[:k]) if decoded is None else decoded
     pose = None
     if likelihood.sample_pose:
         pose = pose_of(position[k : k + POSE_SIZE], pose_sigma)
@@ -101,9 +110,32 @@ def split_position(
     return weights, pose
 
 
-def faces_of_view(observation: Observation, lattice: foam.Lattice) -> Float[Array, "n m"]:
-    """Crossings of every ray: constants of the observation, computed once per view."""
-    return foam.crossings(observation.rays, lattice)
+def faces_of_view(observation: Observation, likelihood: Likelihood) -> Float[Array, "n m"]:
+    """Crossings of every ray that its pixel can tell of: constants of the observation, computed once per view.
+
+    None is farther than a FREE or UNKNOWN ray's limit, or than `reach` behind an OBJECT ray's measured range. The first
+    changes nothing. The second takes a surface there, which only an outlier in depth explains, for a missed mask: the
+    same where the two are equally likely.
+    """
+    t = foam.crossings(observation.rays, likelihood.lattice)
+    behind = jnp.where(observation.range_valid, observation.range + likelihood.reach, jnp.inf)
+    end = jnp.where(observation.status == OBJECT, behind, observation.limit)
+    return jnp.where(t <= end[:, None], t, foam.FAR)
+
+
+def _where_crossed(
+    t: Float[Array, "n m"], most: int, function: Callable[..., Array], *each: Shaped[Array, "n m ..."]
+) -> Shaped[Array, "n m ..."]:
+    """function(*each) at the crossings that are no padding, at `most` so many; 0 elsewhere (most 0: at every slot).
+
+    Rays have few crossings in common numbers: without padding a network has a third of the points to evaluate.
+    """
+    if not most:
+        return function(*each)
+    (index,) = jnp.nonzero(t.ravel() < foam.FAR, size=most, fill_value=t.size)
+    found = function(*(a.reshape(t.size, *a.shape[2:]).at[index].get(mode="clip") for a in each))
+    slots = jnp.zeros((t.size, *found.shape[1:]), found.dtype).at[index].set(found, mode="drop")
+    return slots.reshape(*t.shape, *found.shape[1:])
 
 
 def log_likelihood_one(
@@ -112,9 +144,10 @@ def log_likelihood_one(
     observation: Observation,
     t: Float[Array, "n m"],
     position: Float[Array, "d"],
+    decoded: Float[Array, "w"] | None = None,
 ) -> Float[Array, ""]:
     """log p(observation | one position), summed over pixels."""
-    weights, pose = split_position(model, likelihood, position, observation.pose_sigma)
+    weights, pose = split_position(model, likelihood, position, observation.pose_sigma, decoded)
     offset = range_offset_of(model, likelihood, position, observation.pose_sigma)
     return likelihood.power * jnp.sum(pixel_terms(model.field, weights, pose, likelihood, observation, t, offset))
 
@@ -134,7 +167,7 @@ def pixel_terms(
     scale = jnp.ones(())
     if pose is not None:
         points, scale = pose.to_object(points), jnp.exp(pose.log_scale)
-    sigma = field.density(weights, points) * foam.window(points)
+    sigma = _where_crossed(t, likelihood.packed[1], lambda p: field.density(weights, p) * foam.window(p), points)
     faces = foam.composite(sigma, t, scale / likelihood.lattice.cubes)
     log_miss = faces.log_transmittance[:, -1]
     eps = likelihood.mask_error
@@ -161,7 +194,9 @@ def pixel_terms(
     directions = jnp.broadcast_to(observation.rays.direction[:n_colour, None, :], points[:n_colour].shape)
     if pose is not None:
         directions = pose.to_object_direction(directions)
-    colour = field.colour(weights, points[:n_colour], directions, sigma[:n_colour])
+    colour = _where_crossed(
+        t_hit, likelihood.packed[0], partial(field.colour, weights), points[:n_colour], directions, sigma[:n_colour]
+    )
     w = jnp.exp(log_w)
     mean = mean_colour(jnp.einsum("nm,nmc->nc", w, colour), jnp.sum(w, axis=-1, keepdims=True))
     s = likelihood.colour_sigma
@@ -190,7 +225,7 @@ def mean_colour(premultiplied: Float[Array, "n 3"], opacity: Float[Array, "n 1"]
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def map_with_gradient(
-    function: Callable, batch_size: int | None, shared: Any, each: Any, x: Array
+    function: Callable, batch_size: int | None, shared: Any, each: Any, x: PyTree[Array]
 ) -> Float[Array, "p"]:
     """[function(shared, each_p, x_p) for p], differentiable in `x` alone.
 
@@ -209,7 +244,7 @@ def _map_forward(function, batch_size, shared, each, x):
 
 
 def _map_backward(function, batch_size, gradients, cotangent):
-    return None, None, gradients * cotangent.reshape(-1, *([1] * (gradients.ndim - 1)))
+    return None, None, jax.tree.map(lambda g: g * cotangent.reshape(-1, *([1] * (g.ndim - 1))), gradients)
 
 
 map_with_gradient.defvjp(_map_forward, _map_backward)
@@ -225,7 +260,9 @@ def log_likelihood(
     """
 
     def mapped(args, positions):
-        return map_with_gradient(_one_particle, None, args, None, positions)
+        # together: one by one, each would read the hypernetwork's weights through memory
+        decoded = jax.vmap(args[0].decode)(positions[:, : args[0].latent])
+        return map_with_gradient(_one_particle, None, args, None, (positions, decoded))
 
     devices = jax.devices()
     if len(devices) == 1 or positions.shape[0] % len(devices):
@@ -236,9 +273,9 @@ def log_likelihood(
     return shared(args, positions)
 
 
-def _one_particle(args, _, position):
+def _one_particle(args, _, particle):
     model, likelihood, observation, t = args
-    return log_likelihood_one(model, likelihood, observation, t, position)
+    return log_likelihood_one(model, likelihood, observation, t, *particle)
 
 
 def empty_observation_rays(count: int) -> Rays:

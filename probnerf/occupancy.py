@@ -43,14 +43,16 @@ def wall_opacity(sigma: Float[ArrayLike, "..."], grid: int) -> Float[np.ndarray,
     return -np.expm1(-np.asarray(sigma) / grid)
 
 
-def solid(opacity: Shaped[np.ndarray, "... G G G"]) -> Bool[np.ndarray, "... G G G"]:
+def solid(
+    opacity: Shaped[np.ndarray, "... G G G"], base: Float[ArrayLike, "..."] = BASE_Z
+) -> Bool[np.ndarray, "... G G G"]:
     """Solid occupancy of opacity grids in the view frame: a float in [0, 1], or u8 as round(255 * opacity).
 
     Opacity >= 0.5 marks a wall. Walls are dilated by one voxel (6-connected), every voxel that 6-connected empty space
     cannot reach from outside the cube becomes solid, and the dilation is taken back by an erosion: a closed can is
     solid, the cavity of an open cup is empty. (Filling between the two steps of the closing matters: a closing alone
     cannot seal a pinhole in a wall one or two voxels thick.) The support plane is no wall (a shape whose unseen bottom
-    is open is open), but nothing below BASE_Z is occupied.
+    is open is open), but nothing below `base` is occupied: what each shape stands on (z of the view frame).
     """
     opacity = np.asarray(opacity)
     if opacity.ndim < 3 or len(set(opacity.shape[-3:])) != 1:
@@ -61,8 +63,8 @@ def solid(opacity: Shaped[np.ndarray, "... G G G"]) -> Bool[np.ndarray, "... G G
     flat = walls.reshape(-1, grid, grid, grid)
     filled = np.stack([_fill(wall) for wall in flat]) if len(flat) else flat
     # Last, not first: a bottom that is drawn a little below the plane still seals the object.
-    filled[..., _centre_z(grid) < BASE_Z] = False
-    return filled.reshape(walls.shape)
+    below = _centre_z(grid) < np.asarray(base)[..., None]
+    return filled.reshape(walls.shape) & ~below[..., None, None, :]
 
 
 def voxel_surface(occupied: Bool[np.ndarray, "G G G"]) -> Float[np.ndarray, "n 3"]:

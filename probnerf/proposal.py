@@ -55,7 +55,7 @@ def propose(
     model: ProbNeRF,
     likelihood: Likelihood,
     picture: Picture,
-    pose_sigma: Float[Array, "4"],
+    pose_sigma: Float[Array, "5"],
     populations: int,
     count: int,
     prior_share: float = 0.25,

@@ -40,6 +40,7 @@ class TemperedSMCConfig:
     final_stages: int = 2  # at beta = 1
     keep: int = 2  # the last of them, whose pools become the samples
     max_stages: int = 200
+    evidence_power: float = 1.0  # a population's share of the weight is its evidence estimate to this power
 
     def __post_init__(self) -> None:
         if min(self.populations, self.moves, self.leapfrog_steps, self.max_stages) < 1 or self.particles < 2:
@@ -233,9 +234,10 @@ def tempered_smc(
     number. Without a deadline the answer depends on key and stages alone. The start is always made.
 
     The samples are the pools of the last `keep` stages. A population's share of the weight is its evidence estimate, so
-    that weighted averages stay consistent when populations found different modes. log_evidence is the logarithm of the
-    mean estimate; its error is the larger of two, one from the populations' spread (which is chance with only two) and
-    one from the weights' variance stage by stage (which knows nothing of a mode that all particles missed).
+    that weighted averages stay consistent when populations found different modes; with few particles, whose estimates
+    err by nats, a smaller `evidence_power` keeps a lucky one from silencing the others. log_evidence is the logarithm
+    of the mean estimate; its error is the larger of two, one from the populations' spread (which is chance with only
+    two) and one from the weights' variance stage by stage (which knows nothing of a mode that all particles missed).
 
     result: "converged" (beta = 1 and all final stages), else "budget", "stages" or "interrupted" (Ctrl-C). A run
     stopped before beta = 1 hands back equally weighted draws of the tempered target, which is wider than the posterior,
@@ -278,7 +280,7 @@ def tempered_smc(
             gradients += config.populations * config.particles * config.moves * config.leapfrog_steps
     except KeyboardInterrupt:
         result = "interrupted"
-    return _posterior(state, kept[-config.keep :] or [state.chain], acceptance, divergences, done, gradients, result)
+    return _posterior(config, state, kept or [state.chain], acceptance, divergences, done, gradients, result)
 
 
 def _checked(initial, config: TemperedSMCConfig, dim: int):
@@ -309,10 +311,10 @@ def _progress(stage: int, state: _State, info: _Info, divergences: int, seconds:
     )
 
 
-def _posterior(state: _State, kept: list[HMCState], acceptance, divergences, stages, gradients, result) -> Posterior:
+def _posterior(config, state: _State, kept: list[HMCState], acceptance, divergences, stages, gradients, result):
     # NumPy: the number of kept pools varies, and nothing may compile for it.
-    positions = np.stack([np.asarray(chain.position) for chain in kept])  # [kept, m, n, d]
-    values = np.stack([np.asarray(chain.log_likelihood) for chain in kept])
+    positions = np.stack([np.asarray(chain.position) for chain in kept[-config.keep :]])  # [keep, m, n, d]
+    values = np.stack([np.asarray(chain.log_likelihood) for chain in kept[-config.keep :]])
     populations = values.shape[1]
     estimates = np.asarray(state.log_evidence, np.float64)
     log_evidence = error = float("nan")
@@ -320,7 +322,8 @@ def _posterior(state: _State, kept: list[HMCState], acceptance, divergences, sta
     if np.all(np.asarray(state.beta) == 1.0):
         log_evidence = float(np.logaddexp.reduce(estimates) - np.log(populations))
     if np.isfinite(log_evidence):
-        share = share + estimates - log_evidence
+        share = config.evidence_power * (estimates - log_evidence)
+        share -= np.logaddexp.reduce(share)
         ratio = np.exp(estimates - log_evidence)
         spread = np.std(ratio, ddof=1) / np.sqrt(populations) if populations > 1 else 0.0
         within = np.sqrt(np.sum(ratio**2 * np.asarray(state.variance))) / populations

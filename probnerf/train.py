@@ -125,7 +125,7 @@ def _ray_terms(shared: tuple, item: tuple[_ObjectRays, tuple], weights: Array) -
     """Weighted mean of the joint pixel log-likelihood over a lattice that is turned, shifted and scaled; and solids."""
     field, likelihood, config = shared
     seen, solids = item
-    pose = Pose(yaw=seen.turn[0], x=seen.turn[1], y=seen.turn[2], log_scale=seen.turn[3])
+    pose = Pose(yaw=seen.turn[0], x=seen.turn[1], y=seen.turn[2], log_scale=seen.turn[3], z=jnp.zeros(()))
     scale = jnp.exp(pose.log_scale)
     rays = Rays(origin=_to_view(pose, seen.origin), direction=_turn(pose, seen.direction))
     n = config.object_rays
@@ -139,7 +139,7 @@ def _ray_terms(shared: tuple, item: tuple[_ObjectRays, tuple], weights: Array) -
         range_sigma=jnp.full((count,), 0.01),
         range_valid=seen.range > 0,
         limit=jnp.full((count,), 0.5 * foam.FAR),
-        pose_sigma=jnp.zeros(4),
+        pose_sigma=jnp.zeros(5),
         colour_count=n,
     )
     t = foam.crossings(rays, likelihood.lattice)
@@ -155,7 +155,7 @@ def _turn(pose: Pose, d: Array) -> Array:
 def _to_view(pose: Pose, p: Array) -> Array:
     """Canonical points in the view frame: the inverse of Pose.to_object."""
     base = jnp.array([0.0, 0.0, foam.BASE_Z])
-    return jnp.exp(pose.log_scale) * _turn(pose, p - base) + base + jnp.stack([pose.x, pose.y, jnp.zeros(())])
+    return jnp.exp(pose.log_scale) * _turn(pose, p - base) + base + jnp.stack([pose.x, pose.y, pose.z])
 
 
 def loss(

@@ -39,7 +39,9 @@ class Observation(eqx.Module):
     limit: Float[
         Array, "n"
     ]  # FREE and UNKNOWN: the ray was seen to be empty of the object up to here (0: says nothing)
-    pose_sigma: Float[Array, "4"]  # prior standard deviations: x, y (cube units), log-scale, range offset (cube units)
+    pose_sigma: Float[
+        Array, "5"
+    ]  # prior standard deviations: x, y (cube units), log-scale, range offset and z (cube units)
     colour_count: int = eqx.field(static=True)
 
     def __check_init__(self) -> None:
@@ -48,15 +50,17 @@ class Observation(eqx.Module):
 
 
 class Pose(eqx.Module):
-    """Where the object stands in the view frame: p_view = R_z(yaw) scale (p_object - base) + base + (x, y, 0).
+    """Where the object stands in the view frame: p_view = R_z(yaw) scale (p_object - base) + base + (x, y, z).
 
-    `base` is (0, 0, BASE_Z), so that the object stays on its plane. Leaves may carry leading batch axes.
+    `base` is (0, 0, BASE_Z), so that a larger object stays on its plane, and z is the error of the plane's height that
+    perception measured. Leaves may carry leading batch axes.
     """
 
     yaw: Float[Array, "..."]  # radians, counter-clockwise about z
     x: Float[Array, "..."]  # cube units
     y: Float[Array, "..."]  # cube units
     log_scale: Float[Array, "..."]
+    z: Float[Array, "..."]  # cube units
 
     def to_object(self, points: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
         """View-frame points in the canonical object frame (the lattice stands still, the field moves)."""
@@ -64,7 +68,7 @@ class Pose(eqx.Module):
         inverse_scale = jnp.exp(-self.log_scale)
         u = points[..., 0] - self.x
         v = points[..., 1] - self.y
-        w = points[..., 2] - BASE_Z
+        w = points[..., 2] - BASE_Z - self.z
         return jnp.stack(
             [inverse_scale * (c * u + s * v), inverse_scale * (-s * u + c * v), inverse_scale * w + BASE_Z], axis=-1
         )
@@ -79,7 +83,7 @@ class Pose(eqx.Module):
 def identity_pose() -> Pose:
     """The pose of an object that stands canonically in the cube."""
     zero = jnp.zeros(())
-    return Pose(yaw=zero, x=zero, y=zero, log_scale=zero)
+    return Pose(yaw=zero, x=zero, y=zero, log_scale=zero, z=zero)
 
 
 class Diagnostics(eqx.Module):
@@ -95,7 +99,7 @@ class Diagnostics(eqx.Module):
 
 
 class Posterior(eqx.Module):
-    """Weighted samples. Positions are [z | a, b, x, y, log-scale, range offset | delta], each a priori N(0, 1)."""
+    """Weighted samples. Positions are [z~ | a, b, x, y, log-scale, range offset, z | delta], each a priori N(0, 1)."""
 
     positions: Float[Array, "s d"]
     log_weights: Float[Array, "s"]  # normalised: logsumexp is 0

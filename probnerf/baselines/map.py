@@ -83,7 +83,7 @@ def map_estimate(
     config: MAPConfig,
 ) -> tuple[Float[Array, "d"], Float[Array, "survivors"]]:
     """The best position that Adam reaches from the starts, and the log posterior of each survivor, best first."""
-    args = (model, likelihood, observation, faces_of_view(observation, likelihood.lattice))
+    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
 
     def climb(q: Float[Array, "p d"], steps: int) -> tuple[Array, Array]:
         q, _ = ascend(log_posterior, args, q, replace(config, steps=steps))

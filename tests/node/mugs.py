@@ -74,6 +74,6 @@ def mug_hypotheses(
 
 
 def _opacity(yaw: float, scale: float, grid: int) -> np.ndarray:
-    pose = Pose(*(jnp.asarray(v) for v in (yaw, 0.0, 0.0, scale)))
+    pose = Pose(*(jnp.asarray(v) for v in (yaw, 0.0, 0.0, scale, 0.0)))
     distance = np.asarray(signed_distance(MUG.shape, pose.to_object(jnp.asarray(voxel_centres(grid)))))
     return np.where(distance <= 0.0, 255, 0).astype(np.uint8)

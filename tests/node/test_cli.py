@@ -12,10 +12,10 @@ import pytest
 import node.pipeline
 from node.__main__ import COMMANDS, main
 from perception.controller import Estimate
-from perception.hypotheses import load, load_scene, save
 from perception.log import write_log
 from perception.segment import Segment
 from perception.source import Frame
+from perception.store import load, load_scene, save
 from probnerf.prior import PRESETS, ProbNeRF
 from probnerf.store import Prior, save_prior
 from tests.node.mugs import MUG, mug_hypotheses, table_frame, write_folder

@@ -6,7 +6,7 @@ import jax
 import pytest
 
 from node.__main__ import main
-from perception.hypotheses import load_scene
+from perception.store import load_scene
 from probnerf.prior import PRESETS, ProbNeRF
 from probnerf.store import save_prior
 

@@ -13,14 +13,11 @@ from perception.hypotheses import (
     Hypotheses,
     binary_entropy,
     by_weight,
-    hypotheses_path,
-    load,
-    load_scene,
     meshes,
-    save,
     surface_points,
 )
 from perception.observe import ObjectFrame
+from perception.store import hypotheses_path, load, load_scene, save
 from probnerf.occupancy import voxel_centres
 from probnerf.types import BASE_Z
 
@@ -53,7 +50,7 @@ def _hypotheses(opacity: np.ndarray, weights: list[float], **changes) -> Hypothe
         object_frame=frame,
         T_world_camera=_rigid(2, 0.7, (1.0, 2.0, 0.5)),
         opacity=opacity,
-        pose=np.linspace(0, 1, 4 * len(weights), dtype=np.float32).reshape(-1, 4),
+        pose=np.pad(np.linspace(0, 1, 4 * len(weights), dtype=np.float32).reshape(-1, 4), ((0, 0), (0, 1))),
         weights=np.array(weights),
         population=(np.arange(len(weights)) % 2).astype(np.int32),
         seen=voxel_centres(grid)[..., 0] > 0,
@@ -185,7 +182,7 @@ def _rewrite(path: Path, **changes: object) -> None:
 
 def test_newer_and_inconsistent_files_are_refused(tmp_path, mixed):
     cases = [
-        ({"format": "farside-hypotheses-2"}, "newer than this Farside"),
+        ({"format": "farside-hypotheses-3"}, "newer than this Farside"),
         ({"format": "farside-prior-1"}, "not a hypotheses file"),
         ({"seed": None}, "no field 'seed'"),
         ({"weights": None}, "no field 'weights'"),
@@ -200,6 +197,14 @@ def test_newer_and_inconsistent_files_are_refused(tmp_path, mixed):
         _rewrite(path, **changes)
         with pytest.raises(ValueError, match=message):
             load(path)
+
+
+def test_a_file_of_the_first_format_is_read_as_standing_on_the_plane(tmp_path, mixed):
+    path = tmp_path / "object_3.npz"
+    save(path, mixed)
+    _rewrite(path, format="farside-hypotheses-1", pose=mixed.pose[:, :4])
+    np.testing.assert_array_equal(load(path).base, BASE_Z)
+    np.testing.assert_array_equal(load(path).solid, mixed.solid)
 
 
 class _Trap:

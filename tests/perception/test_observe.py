@@ -88,7 +88,7 @@ def test_a_half_hidden_object_has_wider_widths_and_a_fair_guess() -> None:
     assert np.abs(foot[:2]).max() < 2.0 * cube.xy_sigma
     np.testing.assert_allclose(
         observation.pose_sigma,
-        [cube.xy_sigma, cube.xy_sigma, cube.log_scale_sigma, 0.005 / cube.half_extent],
+        [cube.xy_sigma, cube.xy_sigma, cube.log_scale_sigma, 0.005 / cube.half_extent, 0.005 / cube.half_extent],
         rtol=1e-6,
     )
 

@@ -84,7 +84,7 @@ def test_pixels_are_drawn_from_the_density_that_scores_them():
     def ratios_and_scores(keys):
         def one(key):
             observation = draw_pixels(key, model, likelihood, truth, rays, known, jnp.asarray(True))
-            t = faces_of_view(observation, likelihood.lattice)
+            t = faces_of_view(observation, likelihood)
 
             def value(q):
                 return log_likelihood_one(model, likelihood, observation, t, q)
@@ -110,7 +110,7 @@ def test_object_pixels_are_put_first_and_nothing_else_changes():
     q = jnp.array([0.3, 0.1, 0.5, 0.9, 0.0, 0.0, 0.0, 0.0])
     value = eqx.filter_jit(log_likelihood_one)
     expected = float(value(model, likelihood, observation, t, q))
-    faces = faces_of_view(again, likelihood.lattice)
+    faces = faces_of_view(again, likelihood)
     assert float(value(model, likelihood, again, faces, q)) == pytest.approx(expected, rel=1e-5)
     with pytest.raises(ValueError, match="exceed colour_count 3"):
         object_first(observation, 3)
@@ -131,14 +131,14 @@ def _check(posteriors: list[Posterior], grid: GridPosterior) -> None:
 @pytest.mark.parametrize(("condition", "depth"), QUICK)
 def test_tempered_smc_is_the_posterior(condition, depth):
     args, grid = _scene(condition, depth)
-    _check([tempered_smc(jax.random.key(seed), log_likelihood, args, 8) for seed in (0, 1)], grid)
+    _check([tempered_smc(jax.random.key(seed), log_likelihood, args, 9) for seed in (0, 1)], grid)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("condition", "depth"), CONDITIONS)
 def test_tempered_smc_is_the_posterior_in_every_condition(condition, depth):
     args, grid = _scene(condition, depth)
-    posteriors = [tempered_smc(jax.random.key(seed), log_likelihood, args, 8) for seed in range(2, 6)]
+    posteriors = [tempered_smc(jax.random.key(seed), log_likelihood, args, 9) for seed in range(2, 6)]
     _check(posteriors, grid)
     assert abs(np.mean([float(posterior.log_evidence) for posterior in posteriors]) - grid.log_evidence) <= 0.3
     # The histogram is of the yaw alone; the sizes agree, too.
@@ -160,7 +160,7 @@ def test_tempered_smc_weighs_modes_that_the_mask_alone_cannot_tell_apart():
     grid = integrate(_each, args)
     front = grid.histogram()[[0, 1, 10, 11]].sum()
     assert 0.02 < front < 0.5  # the handle may point at the camera, too
-    posteriors = [tempered_smc(jax.random.key(seed), log_likelihood, args, 8) for seed in range(8)]
+    posteriors = [tempered_smc(jax.random.key(seed), log_likelihood, args, 9) for seed in range(8)]
     _check(posteriors, grid)  # eight: two far modes scatter more
     together = np.mean([_yaw(posterior) for posterior in posteriors], axis=0)
     assert total_variation(together, grid.histogram()) <= 0.1
@@ -175,7 +175,7 @@ def test_annealed_hmc_is_the_posterior_but_for_the_chains_that_annealing_left_be
     # what it does, not what a posterior sampler must.
     args, grid = _scene(condition, depth)
     config = AnnealedHMCConfig(chains=256, leapfrog_steps=5, keep=4)
-    posterior = annealed_hmc(jax.random.key(0), log_likelihood, args, 8, config)
+    posterior = annealed_hmc(jax.random.key(0), log_likelihood, args, 9, config)
     order = np.argsort(grid.log_likelihood)
     lowest = grid.log_likelihood[order][np.searchsorted(np.cumsum(grid.probability[order]), 0.001)] - 2.0
     last = slice(-config.chains, None)

@@ -14,7 +14,7 @@ from probnerf.foam import FAR, Lattice
 from probnerf.prior import PRESETS
 from probnerf.types import BASE_Z, Pose, Rays
 
-POSE = (0.7, 0.08, -0.05, -0.2)  # yaw, x, y, log-scale
+POSE = (0.7, 0.08, -0.05, -0.2, -0.03)  # yaw, x, y, log-scale, z
 
 
 class Slow:
@@ -39,7 +39,7 @@ class Slow:
                 t = (face - origin[axis]) / direction[axis]
                 point = origin + t * direction
                 point[axis] = face
-                low, high = np.array([-self.lattice.extent] * 2 + [BASE_Z]), self.lattice.extent
+                low, high = np.array([-self.lattice.extent] * 2 + [BASE_Z - self.lattice.below]), self.lattice.extent
                 if t > 0 and np.all(point > low - 1e-6) and np.all(point < high + 1e-6):
                     found.append(t)
         return sorted(found)[: self.lattice.crossings]
@@ -47,11 +47,11 @@ class Slow:
     def at(self, point: np.ndarray, direction: np.ndarray) -> tuple[float, np.ndarray]:
         """Density (windowed) and colour at a point of the view frame."""
         if self.pose is not None:
-            yaw, x, y, log_scale = self.pose
+            yaw, x, y, log_scale, z = self.pose
             c, s = np.cos(yaw), np.sin(yaw)
             turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
             base = np.array([0, 0, BASE_Z])
-            point = turn @ (point - base - [x, y, 0]) / np.exp(log_scale) + base
+            point = turn @ (point - base - [x, y, z]) / np.exp(log_scale) + base
             direction = turn @ direction
         field = self.field
         k0, b0, k1, b1, k2, b2, k3, b3, k4, b4, k5, b5, *fitted = self.layers
@@ -138,7 +138,7 @@ def _weights(field: MLPField, seed: int, bias: float = -4.0) -> np.ndarray:
         ("tiny", 15, Lattice(8), None),
         ("tiny", 15, Lattice(8, extent=1.25), POSE),
         ("tiny", 1, Lattice(6, max_crossings=7), None),
-        ("small", 5, Lattice(32, extent=1.1), POSE),
+        ("small", 5, Lattice(32, extent=1.1, below=0.15), POSE),
     ],
 )
 def test_rendering_is_exact(preset, rays, lattice, pose):
@@ -237,7 +237,7 @@ def test_gradients_by_weights_and_by_pose_are_those_of_the_reference():
         ahead = _scalar64(field, weights + step * direction, POSE, rays, lattice)
         behind = _scalar64(field, weights - step * direction, POSE, rays, lattice)
         assert float(by_weights @ direction) == pytest.approx((ahead - behind) / (2 * step), rel=1e-3, abs=1e-3)
-    for i, value in enumerate((by_pose.yaw, by_pose.x, by_pose.y, by_pose.log_scale)):
+    for i, value in enumerate((by_pose.yaw, by_pose.x, by_pose.y, by_pose.log_scale, by_pose.z)):
         ends = [_scalar64(field, weights, _nudged(i, sign * step), rays, lattice) for sign in (1, -1)]
         assert float(value) == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-3, abs=1e-3)
 
@@ -276,7 +276,7 @@ def test_gradients_are_finite_in_empty_and_in_saturated_space(sigma):
 
 
 @pytest.mark.parametrize(
-    "pose", [(0.3, 40.0, 0.0, 0.0), (0.3, 0.0, 0.0, -6.0), (0.3, 0.0, 0.0, 6.0), (1e4, 0.5, 0.5, 0.0)]
+    "pose", [(0.3, 40.0, 0, 0, 0), (0.3, 0.0, 0, -6.0, 0), (0.3, 0.0, 0, 6.0, 0), (1e4, 0.5, 0.5, 0.0, 0)]
 )
 def test_gradients_are_finite_for_points_far_outside_the_cube(pose):
     field, lattice, rays = PRESETS["tiny"].field, Lattice(8, extent=1.25), _rays(9, seed=10)

@@ -19,7 +19,7 @@ def _observed(position: np.ndarray) -> Observation:
     T = look_at(np.array([4.0, 0.0, 2.5]), np.zeros(3))
     origin, direction = pinhole_rays(T, 12 * np.linalg.norm(T[:3, 3]) / 1.2, 24)
     rays = Rays(jnp.asarray(origin), jnp.asarray(direction))
-    pose_sigma = jnp.array([0.1, 0.1, 0.1, 0.0])
+    pose_sigma = jnp.array([0.1, 0.1, 0.1, 0.0, 0.0])
     weights, pose = jax.jit(split_position)(MODEL, LIKELIHOOD, jnp.asarray(position), pose_sigma)
     picture = jax.jit(foam.render)(MODEL.field, weights, rays, LIKELIHOOD.lattice, pose)
     hit = picture.opacity > 0.5
@@ -68,9 +68,9 @@ def test_each_step_sees_its_own_batch():
 
 
 def test_the_yaw_s_prior_is_flat():
-    truth = np.array([0.2, -0.3, 0.8, 0.6, 0.1, 0.2, -0.1], np.float32)
+    truth = np.array([0.2, -0.3, 0.8, 0.6, 0.1, 0.2, -0.1, 0.0, 0.0], np.float32)
     observation = _observed(truth)
-    args = (MODEL, LIKELIHOOD, observation, faces_of_view(observation, LIKELIHOOD.lattice))
+    args = (MODEL, LIKELIHOOD, observation, faces_of_view(observation, LIKELIHOOD))
     stretched = truth.copy()
     stretched[2:4] *= 3.0  # the same yaw
     a, b = jax.jit(log_posterior)(args, None, jnp.asarray(np.stack([truth, stretched])))
@@ -79,15 +79,15 @@ def test_the_yaw_s_prior_is_flat():
 
 def test_a_visible_handle_s_yaw_and_the_body_s_size_are_found_again():
     yaw = 1.0
-    truth = np.array([0.5, 0.4, np.cos(yaw), np.sin(yaw), 0.3, -0.4, 0.2], np.float32)
+    truth = np.array([0.5, 0.4, np.cos(yaw), np.sin(yaw), 0.3, -0.4, 0.2, 0.0, 0.0], np.float32)
     observation = _observed(truth)
     angles = np.arange(6) * np.pi / 3 + 0.4
-    starts = np.zeros((6, 8), np.float32)
+    starts = np.zeros((6, 9), np.float32)
     starts[:, 2], starts[:, 3] = np.cos(angles), np.sin(angles)
     best, values = map_estimate(MODEL, LIKELIHOOD, observation, jnp.asarray(starts), MAPConfig(steps=120))
     assert np.isfinite(values).all() and values.shape == (4,)
     assert values[0] > values[-1] + 10.0  # best first; wrong yaws end lower
-    args = (MODEL, LIKELIHOOD, observation, faces_of_view(observation, LIKELIHOOD.lattice))
+    args = (MODEL, LIKELIHOOD, observation, faces_of_view(observation, LIKELIHOOD))
     at_truth = float(jax.jit(log_posterior)(args, None, jnp.asarray(truth)[None])[0])
     assert float(values[0]) > at_truth - 1.0
     pose = pose_of(best[2:], observation.pose_sigma)

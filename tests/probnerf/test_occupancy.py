@@ -58,6 +58,12 @@ def test_the_plane_is_no_wall_but_nothing_below_it_is_occupied():
     assert not filled[voxel_centres(GRID)[..., 2] < BASE_Z].any()
 
 
+def test_each_shape_is_cut_at_the_height_that_it_stands_on():
+    z, base = voxel_centres(GRID)[0, 0, :, 2], np.array([BASE_Z - 2.1 * WIDTH, BASE_Z, BASE_Z + 2.1 * WIDTH])
+    both = solid(np.ones((3, *(GRID,) * 3)), base)
+    np.testing.assert_array_equal(both[:, 5, 5], z >= base[:, None])
+
+
 def test_the_border_of_the_cube_is_empty_space():
     slab = np.zeros((GRID,) * 3, np.float32)
     slab[:, :, GRID // 2] = 1.0  # cuts the cube in two; both halves are open at the cube's sides
