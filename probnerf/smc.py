@@ -159,7 +159,7 @@ def _start(key, args, q0, log_w0, *, log_likelihood: LogLikelihood, config: Temp
         log_evidence=logsumexp(log_w, axis=1) - np.log(count),
         variance=1.0 / ess - 1.0 / count,
         ancestor=ancestor,
-        step_size=jnp.full(populations, config.longest_step),
+        step_size=jnp.full(populations, config.longest_step, jnp.float32),  # weakly typed, it compiles _stage twice
         metric=_metrics(pool.gradient, log_w, beta, config),
     )
     return state, _Info(ess, jnp.full(populations, jnp.nan), state.step_size, jnp.zeros((), jnp.int32))

@@ -1,6 +1,7 @@
 """Laws of tempered SMC. Bounds are multiples of the Monte Carlo error over runs or populations, seeds fixed."""
 
 import time
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -207,8 +208,9 @@ def test_repeats_exactly_and_compiles_once():
 
     args, *_ = gaussian(DIM, [100.0, 9.0, 1.0])
     other, *_ = gaussian(DIM, [100.0, 9.0, 1.0], seed=1)
-    first = tempered_smc(jax.random.key(0), counted, args, DIM, CONFIG)
+    tempered_smc(jax.random.key(0), counted, args, DIM, CONFIG, stages=1)
     compiled = len(traces)  # the likelihood is called by tracing alone
+    first = tempered_smc(jax.random.key(0), counted, args, DIM, CONFIG)
     again = tempered_smc(jax.random.key(0), counted, args, DIM, CONFIG)
     elsewhere = tempered_smc(jax.random.key(0), counted, other, DIM, CONFIG)
     fresh = tempered_smc(jax.random.key(1), counted, args, DIM, CONFIG, stages=4)
@@ -216,6 +218,22 @@ def test_repeats_exactly_and_compiles_once():
     np.testing.assert_array_equal(first.positions, again.positions)
     assert np.abs(np.asarray(first.positions) - np.asarray(elsewhere.positions)).max() > 0.1
     assert not np.array_equal(first.positions[:128], fresh.positions[:128])
+
+
+def test_evidence_power_flattens_the_populations_shares():
+    args, *_ = gaussian(DIM, [100.0, 9.0, 1.0])
+    runs = [
+        tempered_smc(jax.random.key(0), mixture, args, DIM, replace(CONFIG, evidence_power=power))
+        for power in (1.0, 0.5, 0.0)
+    ]
+    shares = np.array(
+        [np.exp(run.log_weights).reshape(-1)[run.population == p].sum() for run in runs for p in range(4)]
+    )
+    whole, root, even = shares.reshape(3, 4)
+    np.testing.assert_allclose(root, np.sqrt(whole) / np.sqrt(whole).sum(), rtol=1e-4)
+    np.testing.assert_allclose(even, 0.25, rtol=1e-4)
+    assert np.ptp(whole) > 1e-3
+    assert float(runs[0].log_evidence) == float(runs[2].log_evidence)
 
 
 def test_systematic_resampling_copies_each_particle_its_due():
