@@ -43,7 +43,8 @@ def draw_object(path: Path, h: Hypotheses, frame: Frame | None = None, segment: 
     chosen, shares = representatives(h.solid, h.weights, SHOWN)
     for column, (index, share) in enumerate(zip(chosen, shares, strict=True), start=1):
         for row, view in enumerate((front, back)):
-            axes[row, column].imshow(shade.shade(h, h.solid[index], view), interpolation="bilinear")
+            picture = shade.shade(h, h.solid[index], view, float(h.base[index]))
+            axes[row, column].imshow(picture, interpolation="bilinear")
         axes[0, column].set_title(f"{100 * share:.0f}% of the weight", fontsize=11)
     axes[0, 1].set_ylabel("from the camera", fontsize=11)
     axes[1, 1].set_ylabel("from behind", fontsize=11)

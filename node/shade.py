@@ -63,10 +63,12 @@ def look_up(image: np.ndarray, camera: Camera, frame: ObjectFrame, view: Viewpoi
     return found.reshape(view.size, view.size, *image.shape[2:])
 
 
-def shade(h: Hypotheses, solid: Bool[np.ndarray, "G G G"], view: Viewpoint) -> Float[np.ndarray, "s s 3"]:
-    """A shape on its plane, lit from above the viewer's left; surface that the camera saw is grey, the rest orange."""
+def shade(
+    h: Hypotheses, solid: Bool[np.ndarray, "G G G"], view: Viewpoint, base: float = BASE_Z
+) -> Float[np.ndarray, "s s 3"]:
+    """A shape on the plane at height `base`, lit from above left; grey where the camera saw it, orange elsewhere."""
     rgb = np.ones((len(view.directions), 3))
-    ground = _meet_ground(view)
+    ground = _meet_ground(view, base)
     with np.errstate(invalid="ignore"):
         on_ground = view.origin + ground[:, None] * view.directions
     lit = np.isfinite(ground) & (np.abs(on_ground[:, :2]) < 1.0).all(axis=1)
@@ -139,9 +141,9 @@ def largest_along(values: Float[np.ndarray, "G G G"], view: Viewpoint) -> Float[
     return out.reshape(view.size, view.size)
 
 
-def _meet_ground(view: Viewpoint) -> Float[np.ndarray, "n"]:
+def _meet_ground(view: Viewpoint, base: float) -> Float[np.ndarray, "n"]:
     with np.errstate(divide="ignore"):
-        t = (BASE_Z - view.origin[2]) / view.directions[:, 2]
+        t = (base - view.origin[2]) / view.directions[:, 2]
     return np.where(t > 0, t, np.inf)
 
 

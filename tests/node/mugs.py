@@ -57,7 +57,7 @@ def mug_hypotheses(
         "object_frame": cube,
         "T_world_camera": None,
         "opacity": np.stack([_opacity(yaw, scale, grid) for yaw in yaws]),
-        "pose": np.array([[yaw, 0.0, 0.0, scale] for yaw in yaws], np.float32),
+        "pose": np.array([[yaw, 0.0, 0.0, scale, 0.0] for yaw in yaws], np.float32),
         "weights": np.array(weights),
         "population": np.arange(len(yaws)) % 2,
         "seen": seen_voxels(frame, cube, grid),

@@ -41,7 +41,7 @@ def _object(shapes: list[np.ndarray], weights: list[float], origin=(0.0, 0.0, 0.
         ),
         T_world_camera=None,
         opacity=np.stack(shapes),
-        pose=np.zeros((len(shapes), 4), np.float32),
+        pose=np.zeros((len(shapes), 5), np.float32),
         weights=np.array(weights),
         population=np.arange(len(shapes), dtype=np.int32) % 2,
         seen=np.broadcast_to(voxel_centres(GRID)[..., 1] < 0, (GRID,) * 3),
