@@ -109,6 +109,7 @@ def estimate(
             "point_gradients": float(d.point_gradients) * likelihood.packed[1],
             "explained": fit,
             "power": likelihood.power,
+            "evidence_power": config.infer.smc.evidence_power,
         },
         result=posterior.result,
     )

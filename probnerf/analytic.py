@@ -115,7 +115,7 @@ def scene(condition: str, depth: bool, seed: int = 0, columns: int = 12, rows: i
     bare = foam.Lattice(cubes)
     likelihood = Likelihood(foam.Lattice(cubes, max_crossings=foam.count_crossings(rays, bare)))
     yaw = np.deg2rad(YAW_OF[condition])
-    position = jnp.array([0.3, 0.1, np.cos(yaw), np.sin(yaw), 0.0, 0.0, 0.0, 0.0], jnp.float32)
+    position = jnp.array([0.3, 0.1, np.cos(yaw), np.sin(yaw), 0.0, 0.0, 0.0, 0.0, 0.0], jnp.float32)
     known = jnp.arange(columns * rows) >= (columns // 2 * rows if condition == "half" else 0)
     model = CylinderModel()
     key = jax.random.key(seed)
@@ -198,7 +198,7 @@ def integrate(
 def _evaluate(log_likelihood: Callable, args: Any, chunk: int, cells: np.ndarray) -> np.ndarray:
     """Log-likelihood of each cell's centre, `chunk` at a time."""
     yaw, z = cells[:, :1], cells[:, 1:]
-    positions = np.concatenate([z, np.cos(yaw), np.sin(yaw), np.zeros((len(cells), 4))], axis=1).astype(np.float32)
+    positions = np.concatenate([z, np.cos(yaw), np.sin(yaw), np.zeros((len(cells), 5))], axis=1).astype(np.float32)
     padded = np.pad(positions, ((0, -len(cells) % chunk), (0, 0)), mode="edge").reshape(-1, chunk, positions.shape[1])
     parts = [np.asarray(_compiled(log_likelihood, args, part)) for part in padded]
     return np.concatenate(parts)[: len(cells)].astype(np.float64)

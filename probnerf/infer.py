@@ -29,6 +29,7 @@ from probnerf.smc import TemperedSMCConfig, tempered_smc
 from probnerf.types import OBJECT, UNKNOWN, Observation, Pose, Posterior
 
 Method = Literal["tempered_smc", "annealed_hmc"]
+WALL_ERROR = 0.02  # cube units; how well the prior's shapes place a wall
 
 
 def quick_smc() -> TemperedSMCConfig:
@@ -195,7 +196,8 @@ def explained(
 ) -> Float[Array, "s"]:
     """Share of telling pixels that each position explains: object pixels hit at the measured range, free ones missed.
 
-    A range is explained within 3 standard deviations (sensor, wall and face spacing) or 0.06 cube units.
+    A range is explained within 3 standard deviations of the sensor's error and of a well-placed wall's (`WALL_ERROR`):
+    what the likelihood forgives (`wall_sigma`) is more than what a shape of the prior needs.
     """
     t = faces_of_view(observation, likelihood)
     status = observation.status
@@ -210,7 +212,7 @@ def explained(
         faces = foam.composite(sigma, t, scale / likelihood.lattice.cubes)
         w = jnp.exp(faces.log_weight)
         hit = -jnp.expm1(faces.log_transmittance[:, -1])
-        tolerance = jnp.maximum(3.0 * jnp.sqrt(observation.range_sigma**2 + likelihood.wall_sigma**2), 0.06)
+        tolerance = 3.0 * jnp.sqrt(observation.range_sigma**2 + WALL_ERROR**2)
         offset = range_offset_of(model, likelihood, position, observation.pose_sigma)
         close = jnp.abs(t - (observation.range - offset)[:, None]) <= tolerance[:, None]
         at_range = jnp.sum(jnp.where(close, w, 0.0), axis=-1)

@@ -114,8 +114,8 @@ def faces_of_view(observation: Observation, likelihood: Likelihood) -> Float[Arr
     """Crossings of every ray that its pixel can tell of: constants of the observation, computed once per view.
 
     None is farther than a FREE or UNKNOWN ray's limit, or than `reach` behind an OBJECT ray's measured range. The first
-    changes nothing. The second takes a surface there, which only an outlier in depth explains, for a missed mask: the
-    same where the two are equally likely.
+    changes nothing. The second takes a surface there, which only an outlier in depth explains, for a missed mask: as
+    likely where the two shares are equal, but for the colour.
     """
     t = foam.crossings(observation.rays, likelihood.lattice)
     behind = jnp.where(observation.range_valid, observation.range + likelihood.reach, jnp.inf)

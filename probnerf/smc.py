@@ -49,8 +49,8 @@ class TemperedSMCConfig:
             raise ValueError(
                 f"TemperedSMCConfig: start_particles {self.start_particles} must be at least particles {self.particles}"
             )
-        if not (0 < self.ess_target < 1 and 0 < self.target_acceptance < 1):
-            raise ValueError("TemperedSMCConfig: ess_target and target_acceptance must lie between 0 and 1")
+        if not (0 < self.ess_target < 1 and 0 < self.target_acceptance < 1 and 0 <= self.evidence_power <= 1):
+            raise ValueError("TemperedSMCConfig: ess_target, target_acceptance and evidence_power: between 0 and 1")
         if not 1 <= self.keep <= self.final_stages:
             raise ValueError(
                 f"TemperedSMCConfig: keep {self.keep} must lie between 1 and final_stages {self.final_stages}"
@@ -322,7 +322,7 @@ def _posterior(config, state: _State, kept: list[HMCState], acceptance, divergen
     if np.all(np.asarray(state.beta) == 1.0):
         log_evidence = float(np.logaddexp.reduce(estimates) - np.log(populations))
     if np.isfinite(log_evidence):
-        share = config.evidence_power * (estimates - log_evidence)
+        share = config.evidence_power * np.maximum(estimates - log_evidence, -1e4)  # 0 times -inf is no number
         share -= np.logaddexp.reduce(share)
         ratio = np.exp(estimates - log_evidence)
         spread = np.std(ratio, ddof=1) / np.sqrt(populations) if populations > 1 else 0.0

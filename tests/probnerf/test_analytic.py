@@ -107,7 +107,7 @@ def test_object_pixels_are_put_first_and_nothing_else_changes():
     assert is_object[: is_object.sum()].all() and is_object.sum() <= observation.colour_count < is_object.size
     turned = jax.tree.map(lambda a: a[::-1] if a.ndim and len(a) == is_object.size else a, observation)
     again = object_first(turned, observation.colour_count)
-    q = jnp.array([0.3, 0.1, 0.5, 0.9, 0.0, 0.0, 0.0, 0.0])
+    q = jnp.array([0.3, 0.1, 0.5, 0.9, 0.0, 0.0, 0.0, 0.0, 0.0])
     value = eqx.filter_jit(log_likelihood_one)
     expected = float(value(model, likelihood, observation, t, q))
     faces = faces_of_view(again, likelihood)
