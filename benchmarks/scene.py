@@ -204,8 +204,8 @@ def _frequency(objects: TabletopObject, poses: Pose, grid: int) -> Float[Array, 
 def base_rate(objects: int = 1024, grid: int = GRID, config: ObserveConfig | None = None) -> Float[np.ndarray, "g g g"]:
     """Training-set frequency of occupancy in the view frame: family objects at any yaw, placed by perception's widths.
 
-    The law has the cube's symmetries about the vertical (quarter turns and a mirror), so the estimate is averaged over
-    all eight.
+    All stand on the plane (z = 0). The law has the cube's symmetries about the vertical (quarter turns, a mirror), so
+    the estimate is averaged over all eight.
     """
     config = config or ObserveConfig()
     rng = np.random.default_rng(29)

@@ -59,8 +59,8 @@ class InferConfig:
     extent: float = 1.1  # the lattice covers [-extent, extent]^3: an object may be larger than its guessed cube
     below: float = 0.15  # and so much under the plane, for its height is uncertain
     colour_sigma: float = 0.3  # s: what the prior cannot draw of a print or a band, too
-    wall_sigma: float = 0.05  # cube units: the model's own error in a wall's place; wide, so that small misfits cost
-    outlier: float = 0.01  # little beside a wall where there is none: share of ranges from nowhere
+    wall_sigma: float = 0.05  # cube units: the model's own error in a wall's place; wide, for small misfits are shared
+    outlier: float = 0.01  # share of ranges from nowhere; small, for a lid over a visible cavity is no outlier
     reach: float = 0.3  # cube units behind a measured range beyond which nothing is asked
     power: float = 0.5  # kappa: pixels' misfits are not independent, so that each counts as less than one
     encoder_starts: bool = True  # propose starts by the encoder, in a defensive mixture with the prior

@@ -128,7 +128,7 @@ def _where_crossed(
 ) -> Shaped[Array, "n m ..."]:
     """function(*each) at the crossings that are no padding, at `most` so many; 0 elsewhere (most 0: at every slot).
 
-    Rays have few crossings in common numbers: without padding a network has a third of the points to evaluate.
+    Rays differ in their number of crossings, so that most slots are padding, and the field is what costs.
     """
     if not most:
         return function(*each)
