@@ -1,0 +1,98 @@
+"""Camera files: the YAML that ROS's camera_info_manager writes and reads, with what a calibration knows besides."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from calibration.camera import Camera
+
+# ROS's reader takes the keys that it knows and passes over this one.
+_OURS = "farside_calibration"
+
+
+def write_camera(path: Path, camera: Camera, name: str = "camera") -> None:
+    """Write a camera to YAML, whole or not at all; `read_camera` gives exactly it back.
+
+    Keys are those of ROS's camera_calibration_parsers. The standard deviations and the RMS (px) stand under a key of
+    our own.
+    """
+    distortion = camera.distortion
+    content: dict[str, Any] = {
+        "image_width": camera.width,
+        "image_height": camera.height,
+        "camera_name": name,
+        "camera_matrix": _matrix(camera.K),
+        "distortion_model": camera.model,
+        "distortion_coefficients": _matrix(distortion[None]),
+        "rectification_matrix": _matrix(np.eye(3)),
+        "projection_matrix": _matrix(np.column_stack([camera.K, np.zeros(3)])),
+    }
+    ours: dict[str, Any] = {}
+    if camera.rms is not None:
+        ours["rms"] = float(camera.rms)
+    if camera.K_std is not None:
+        ours["camera_matrix_std"] = _matrix(camera.K_std)
+    if camera.distortion_std is not None:
+        ours["distortion_std"] = _matrix(camera.distortion_std[None])
+    if ours:
+        content[_OURS] = ours
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120), encoding="utf-8")
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def read_camera(path: Path) -> Camera:
+    """The camera in a YAML file of ROS's or ours. Raises FileNotFoundError, or ValueError naming file and remedy."""
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+        raise FileNotFoundError(f"{path}: no such camera file; `farside calibrate` writes one") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not YAML ({' '.join(str(error).split())}); calibrate again") from None
+    try:
+        if not isinstance(content, Mapping):
+            raise ValueError("it has no keys")
+        ours = content.get(_OURS) or {}
+        K_std, distortion_std, rms = (ours.get(k) for k in ("camera_matrix_std", "distortion_std", "rms"))
+        return Camera(
+            width=_whole(content, "image_width"),
+            height=_whole(content, "image_height"),
+            K=_array(content, "camera_matrix"),
+            distortion=_array(content, "distortion_coefficients").ravel(),
+            model=str(content.get("distortion_model", "plumb_bob")),
+            K_std=None if K_std is None else _array(ours, "camera_matrix_std"),
+            distortion_std=None if distortion_std is None else _array(ours, "distortion_std").ravel(),
+            rms=None if rms is None else float(rms),
+        )
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is no camera file: {error}; calibrate again") from None
+
+
+def _matrix(values: np.ndarray) -> dict[str, Any]:
+    rows, cols = values.shape
+    return {"rows": rows, "cols": cols, "data": [float(v) for v in values.ravel()]}
+
+
+def _array(content: Mapping, key: str) -> np.ndarray:
+    entry = content.get(key)
+    if not isinstance(entry, Mapping) or not {"rows", "cols", "data"} <= set(entry):
+        raise ValueError(f"{key} is {entry!r}, not rows, cols and data")
+    data = np.array(entry["data"], dtype=np.float64)
+    if data.size != entry["rows"] * entry["cols"]:
+        raise ValueError(f"{key} has {data.size} numbers for {entry['rows']}x{entry['cols']}")
+    return data.reshape(entry["rows"], entry["cols"])
+
+
+def _whole(content: Mapping, key: str) -> int:
+    value = content.get(key)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f"{key} is {value!r}, not a whole number")
+    return value
