@@ -2,23 +2,34 @@
 
 import json
 import subprocess
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from node.plot import draw_training
 from probnerf import foam
 from probnerf import train as training
+from probnerf.families.srn import read_views
 from probnerf.families.tabletop import TRAIN_SEEDS
+from probnerf.grow import grow
 from probnerf.model import Likelihood
 from probnerf.prior import PRESETS, ProbNeRF
-from probnerf.solids import draw_solids
+from probnerf.solids import Solids, draw_solids
 from probnerf.store import load_prior, save_prior
-from probnerf.views import draw_views
+from probnerf.views import ViewSet, draw_views
 
 
 @dataclass(frozen=True)
@@ -35,8 +46,12 @@ class Training:
     """Training objects: the first seeds of the family."""
     pictured: int = 4_000
     """Of these, the first so many are also seen in pictures."""
-    pictures: int = 8
-    """Pictures of each of them."""
+    data: Path | None = None
+    """Train on the posed pictures in this folder alone (SRN layout, as `farside capture` writes it), not on tabletop
+    objects. Every step is one of rays then: --solid-steps is 0, --learning-rate holds throughout, and --objects and
+    --pictured are not read."""
+    pictures: int | None = None
+    """Pictures of each of them; 8 by default, or all with --data."""
     recipe: training.TrainConfig = field(default_factory=training.TrainConfig)
 
 
@@ -46,33 +61,25 @@ def train(options: Training, out: Console, err: Console) -> bool:
     Raises ValueError where the folder holds another recipe, FloatingPointError where the loss is no number.
     """
     preset, config, folder = PRESETS[options.preset], options.recipe, options.out
+    if options.data is not None:  # there is no phase in which a decoder could learn first
+        config = replace(config, solid_steps=0, ray_learning_rate=config.learning_rate)
     if not 1 <= options.objects <= len(TRAIN_SEEDS):
         raise ValueError(f"--objects is {options.objects}; give 1 to {len(TRAIN_SEEDS)}")
     if options.pictured < 1:
         raise ValueError(f"--pictured is {options.pictured}; give 1 or more")
-    pictured = min(options.pictured, options.objects)
+    if options.pictures is not None and options.pictures < 1:
+        raise ValueError(f"--pictures is {options.pictures}; give 1 or more")
     begun = None if options.start is None else load_prior(options.start, preset=options.preset)
+    key = np.array([0, config.seed], np.uint32)  # a raw key
+    model = ProbNeRF(preset, key) if begun is None else grow(begun.model, preset, key)  # type: ignore[arg-type]
     history, curves, weights = folder / "history.jsonl", folder / "curves.png", folder / "prior.safetensors"
     likelihood = Likelihood(lattice=foam.Lattice(preset.lattice, 1.0, 9 * preset.lattice // 4))
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     state = None
     try:
         with Progress(*columns, TimeRemainingColumn(), console=err, disable=not err.is_terminal) as progress:
-            sampling = progress.add_task("objects", total=options.objects)
-            seeds = np.asarray(TRAIN_SEEDS[: options.objects])
-            solids = draw_solids(seeds, progress=lambda done, total: progress.update(sampling, completed=done))
-            drawing = progress.add_task("pictures", total=pictured)
-            views = draw_views(
-                seeds[:pictured],
-                options.pictures,
-                preset.image_size,
-                progress=lambda done, total: progress.update(drawing, completed=done),
-            )
+            solids, views, story = _material(options, preset.image_size, progress)
             steps = progress.add_task("steps", total=config.steps)
-            if begun is not None:
-                model = begun.model
-            else:
-                model = ProbNeRF(preset, np.array([0, config.seed], np.uint32))  # type: ignore[arg-type]  # a raw key
             for state, metrics in training.train(model, solids, views, likelihood, config, folder):  # noqa: B007
                 text = "steps  " + "  ".join(f"{k} {v:.4g}" for k, v in metrics.items() if k != "step")
                 progress.update(steps, completed=int(metrics["step"]), description=text)
@@ -86,11 +93,7 @@ def train(options: Training, out: Console, err: Console) -> bool:
     if state is None:
         out.print(f"{folder} is trained already", highlight=False, soft_wrap=True)
         return True
-    story = {
-        "family": "tabletop",
-        "seeds": [TRAIN_SEEDS.start, TRAIN_SEEDS.start + options.objects],
-        "pictured": pictured,
-        "pictures": options.pictures,
+    story |= {
         "recipe": asdict(config),
         "steps": int(state.step),
         "revision": _revision(),
@@ -100,6 +103,26 @@ def train(options: Training, out: Console, err: Console) -> bool:
     save_prior(weights, state.model, story)
     out.print(f"{weights}; judge it with `farside bench prior --prior {weights}`", highlight=False, soft_wrap=True)
     return True
+
+
+def _material(options: Training, size: int, progress: Progress) -> tuple[Solids | None, ViewSet, dict[str, Any]]:
+    """What is trained on, and what the weights' metadata say of it."""
+
+    def advance(task: TaskID) -> Callable[[int, int], None]:
+        return lambda done, total: progress.update(task, completed=done, total=total)
+
+    if options.data is not None:
+        reading = progress.add_task("objects", total=None)
+        views = read_views(options.data, size, options.pictures, advance(reading))
+        return None, views, {"family": "srn", "data": options.data.name, "objects": len(views.seeds)}
+    sampling = progress.add_task("objects", total=options.objects)
+    seeds = np.asarray(TRAIN_SEEDS[: options.objects])
+    solids = draw_solids(seeds, progress=advance(sampling))
+    pictured, pictures = min(options.pictured, options.objects), options.pictures or 8
+    drawing = progress.add_task("pictures", total=pictured)
+    views = draw_views(seeds[:pictured], pictures, size, progress=advance(drawing))
+    seed_range = [TRAIN_SEEDS.start, TRAIN_SEEDS.start + options.objects]
+    return solids, views, {"family": "tabletop", "seeds": seed_range, "pictured": pictured, "pictures": pictures}
 
 
 def _revision() -> str:

@@ -41,7 +41,7 @@ class Batch(eqx.Module):
     origin: Data  # f32 [b, n, 3]
     direction: Data  # f32 [b, n, 3]
     ray_rgb: Data  # f32 [b, n, 3]
-    ray_range: Data  # f32 [b, n], 0 on a miss
+    ray_range: Data  # f32 [b, n], 0 on a miss, negative on the object where it is unknown
     ray_weight: Data  # f32 [b, n], sums to about 1: the unbiased mean over all pixels of all views
     turn: Data  # f32 [b, 4] yaw, x, y, log-scale of the object over the standing lattice
 
@@ -57,7 +57,7 @@ class Strata(eqx.Module):
 def strata_of(views: ViewSet) -> Strata:
     """Sort every object's pixels into object, near and far."""
     n = len(views.seeds)
-    mask = views.range > 0
+    mask = views.range != 0  # negative: an object pixel without a range
     near = ndimage.binary_dilation(mask, np.ones((1, 1, 5, 5), bool))
     stratum = np.where(mask, 0, np.where(near, 1, 2)).astype(np.uint8).reshape(n, -1)
     order = np.argsort(stratum, axis=1, kind="stable").astype(np.int32)
@@ -67,7 +67,7 @@ def strata_of(views: ViewSet) -> Strata:
 def draw_batch(views: ViewSet, strata: Strata, config: BatchConfig, step: int, size: int) -> Batch:
     """The batch of one step: a function of (seed, step) alone, so that a resumed run repeats the lost one."""
     rng = np.random.default_rng([config.seed, step, 3])
-    chosen = rng.choice(len(views.seeds), size, replace=False)
+    chosen = rng.choice(len(views.seeds), size, replace=len(views.seeds) < size)
     j, s = config.views, views.size
     view = np.stack([rng.permutation(views.rgb.shape[1])[:j] for _ in chosen])
     rows = chosen[:, None]

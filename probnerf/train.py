@@ -9,7 +9,8 @@ an unbiased estimate of its mean over all pixels.
 
 Unlike the paper's, q(z) is not read off pictures: `Recognition` is told the object's exact description, and the decoder
 learns several times faster. The picture encoder learns to cover the recognised z (forward KL), so that what a view
-leaves open stays open in its answer.
+leaves open stays open in its answer. With pictures alone (`solids` is None) it is the paper's way: every step is one of
+rays, with q(z) from the picture encoder.
 """
 
 import json
@@ -121,8 +122,11 @@ class _ObjectRays(eqx.Module):
     turn: Array
 
 
-def _ray_terms(shared: tuple, item: tuple[_ObjectRays, tuple], weights: Array) -> Float[Array, ""]:
-    """Weighted mean of the joint pixel log-likelihood over a lattice that is turned, shifted and scaled; and solids."""
+def _ray_terms(shared: tuple, item: tuple[_ObjectRays, tuple | None], weights: Array) -> Float[Array, ""]:
+    """Weighted mean of the joint pixel log-likelihood over a lattice that is turned, shifted and scaled; and solids.
+
+    The first rays are the object's; one whose range is negative has none, and says only that it hits, and its colour.
+    """
     field, likelihood, config = shared
     seen, solids = item
     pose = Pose(yaw=seen.turn[0], x=seen.turn[1], y=seen.turn[2], log_scale=seen.turn[3], z=jnp.zeros(()))
@@ -144,7 +148,8 @@ def _ray_terms(shared: tuple, item: tuple[_ObjectRays, tuple], weights: Array) -
     )
     t = foam.crossings(rays, likelihood.lattice)
     terms = pixel_terms(field, weights, pose, likelihood, observation, t)
-    return config.effective_rays * jnp.sum(seen.weight * terms) + _solid_terms(shared, solids, weights)
+    fit = config.effective_rays * jnp.sum(seen.weight * terms)
+    return fit if solids is None else fit + _solid_terms(shared, solids, weights)
 
 
 def _turn(pose: Pose, d: Array) -> Array:
@@ -160,26 +165,35 @@ def _to_view(pose: Pose, p: Array) -> Array:
 
 def loss(
     networks: tuple[ProbNeRF, Recognition],
-    solids: Solids,
+    solids: Solids | None,
     batch: Batch | None,
     key: Array,
     kl_weight: Array,
     likelihood: Likelihood,
     config: TrainConfig,
 ) -> tuple[Array, dict[str, Array]]:
-    """Negative ELBO per object, with q(z) by recognition; with `batch`, rays and the encoder's loss too. And parts."""
+    """Negative ELBO per object, with q(z) by recognition; with `batch`, rays and the encoder's loss too. And parts.
+
+    Without `solids`, q(z) is the encoder's, and rays are all that there is.
+    """
     model, recognition = networks
     k0, k1, k2 = jax.random.split(key, 3)
-    mean, precision = jax.vmap(lambda o: recognition(description(o)))(solids.objects)
+    if solids is None:
+        assert batch is not None, "neither solids nor rays"
+        mean, precision = encode(model, batch)
+    else:
+        mean, precision = jax.vmap(lambda o: recognition(description(o)))(solids.objects)
     z = mean + jax.random.normal(k0, mean.shape) / jnp.sqrt(precision)
     kl = jnp.mean(jax.vmap(kl_estimate, in_axes=(None, 0, 0, 0))(model, z, mean, precision))
     weights = jax.vmap(model.hyper)(z)
-    each: tuple = (*shape_samples(solids, k1, config.points), *colour_samples(solids, k2, config.colours))
+    each: tuple | None = None
+    if solids is not None:
+        each = (*shape_samples(solids, k1, config.points), *colour_samples(solids, k2, config.colours))
     terms, encoder = _solid_terms, jnp.zeros(())
     if batch is not None:
         drawn = (batch.origin, batch.direction, batch.ray_rgb, batch.ray_range, batch.ray_weight, batch.turn)
         terms, each = _ray_terms, (_ObjectRays(*map(jnp.asarray, drawn)), each)
-        encoder = encoder_loss(model, batch, z)
+        encoder = encoder_loss(model, batch, z) if solids is not None else encoder
     bound = _Bound(terms, (model.field, likelihood, config))
     fit = jnp.mean(map_with_gradient(bound, config.map_batch, None, each, weights))
     return kl_weight * kl - fit + encoder, {"fit": fit, "kl": kl, "encoder": encoder}
@@ -246,7 +260,7 @@ def initial_state(model: ProbNeRF, config: TrainConfig) -> TrainState:
 
 @eqx.filter_jit(donate="all-except-first")
 def train_step(
-    static: tuple[Likelihood, TrainConfig], state: TrainState, solids: Solids, batch: Batch | None
+    static: tuple[Likelihood, TrainConfig], state: TrainState, solids: Solids | None, batch: Batch | None
 ) -> tuple[TrainState, dict[str, Array]]:
     """One update: of the solid phase without `batch`."""
     likelihood, config = static
@@ -271,13 +285,17 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
 
 
 def train(
-    model: ProbNeRF, solids: Solids, views: ViewSet, likelihood: Likelihood, config: TrainConfig, folder: Path
+    model: ProbNeRF, solids: Solids | None, views: ViewSet, likelihood: Likelihood, config: TrainConfig, folder: Path
 ) -> Iterator[tuple[TrainState, dict[str, float]]]:
     """Run or resume in `folder`; yields (state, metrics) every `log_every` steps and appends them to history.jsonl.
 
-    `views` are pictures of the first so many objects of `solids`.
+    `views` are pictures of the first so many objects of `solids`; None trains on pictures alone, with no solid phase.
     Raises FloatingPointError on a non-finite loss, naming the step; the last checkpoint stays.
     """
+    if solids is None and config.solid_steps:
+        raise ValueError(f"solid_steps is {config.solid_steps}; it must be 0 where there are pictures alone")
+    if config.steps > config.solid_steps and views.rgb.shape[1] < config.views:
+        raise ValueError(f"--views is {config.views} but objects have {views.rgb.shape[1]} pictures; give no more")
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint, history = folder / "checkpoint.eqx", folder / "history.jsonl"
     state = initial_state(jax.tree.map(jnp.copy, model), config)  # its own buffers: a step gives its inputs away
@@ -294,10 +312,10 @@ def train(
     strata = strata_of(views)
     start = int(state.step)
 
-    def data_of(step: int) -> tuple[Solids, Batch | None]:
-        if step >= config.solid_steps:
+    def data_of(step: int) -> tuple[Solids | None, Batch | None]:
+        if solids is None or step >= config.solid_steps:
             batch = draw_batch(views, strata, config, step, config.ray_batch)
-            return solids[np.asarray(batch.rows)], batch
+            return None if solids is None else solids[np.asarray(batch.rows)], batch
         rng = np.random.default_rng([config.seed, step, 3])
         return solids[rng.choice(len(solids.point), config.batch, replace=False)], None
 

@@ -248,7 +248,12 @@ def sample_objects(seeds: Sequence[int], slack: float = 1.0) -> TabletopObject:
 
 
 def description(obj: TabletopObject) -> Float[Array, "p"]:
-    """Everything that shape and looks depend on, as one vector of numbers of order 1: what training is told of it."""
+    """Everything that shape and looks depend on, as one vector of numbers of order 1: what training is told of it.
+
+    Angles are told as cosine and sine, and a pattern that is not painted as zeros.
+    """
+    patterned = (obj.texture == LABELLED) | (obj.texture == PRINTED)
+    per_height, phase, threshold = obj.bands
     parts = [
         3.0 * obj.outline,
         3.0 * obj.box,
@@ -256,10 +261,10 @@ def description(obj: TabletopObject) -> Float[Array, "p"]:
         10.0 * obj.tube_section,
         obj.spout,
         2.0 * obj.paint - 1.0,
-        obj.bands,
-        obj.label,
-        0.1 * obj.waves,
-        obj.pattern_level,
+        (obj.texture == BANDED) * jnp.stack([0.5 * per_height, *_turn(2.0 * jnp.pi * phase), threshold]),
+        (obj.texture == LABELLED) * jnp.stack([*_turn(obj.label[0]), *obj.label[1:]]),
+        patterned * jnp.concatenate([0.1 * obj.waves[..., :3], jnp.stack(_turn(obj.waves[..., 3]), axis=-1)], axis=-1),
+        patterned * obj.pattern_level,
         obj.lid_start,
         obj.light,
         obj.ambient,
@@ -272,3 +277,7 @@ def description(obj: TabletopObject) -> Float[Array, "p"]:
         20.0 * obj.shift,
     ]
     return jnp.concatenate([jnp.clip(jnp.ravel(part).astype(jnp.float32), -5.0, 5.0) for part in parts])
+
+
+def _turn(angle: Float[Array, "..."]) -> tuple[Array, Array]:
+    return jnp.cos(angle), jnp.sin(angle)

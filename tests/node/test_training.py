@@ -11,6 +11,8 @@ import pytest
 
 import node.training
 from node.__main__ import main
+from probnerf.families.render import look_at
+from probnerf.families.srn import NO_RANGE, Instance, write_instance
 from probnerf.solids import Solids
 from probnerf.store import load_prior
 from probnerf.train import TrainConfig
@@ -33,7 +35,7 @@ class Trainer:
         self.asked: dict[str, Any] = {}
 
     def __call__(
-        self, model: Any, solids: Solids, views: ViewSet, likelihood: Any, config: TrainConfig, folder: Path
+        self, model: Any, solids: Solids | None, views: ViewSet, likelihood: Any, config: TrainConfig, folder: Path
     ) -> Iterator:
         self.asked = {"model": model, "solids": solids, "views": views, "config": config, "likelihood": likelihood}
         folder.mkdir(parents=True, exist_ok=True)
@@ -87,6 +89,31 @@ def test_training_goes_on_from_weights_of_the_same_preset(
     assert started["hash"] == load_prior(weights).hash and started["recipe"]["seed"] == 4
     assert run(tmp_path / "c", "--preset", "small", "--start", str(weights)) == 1
     assert "holds preset 'tiny', not 'small'" in capsys.readouterr().err
+
+
+def test_pictures_of_ones_own_take_the_place_of_procedural_objects(
+    tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture
+) -> None:
+    rgb, mask = np.zeros((4, 16, 16, 3), np.uint8), np.zeros((4, 16, 16), bool)
+    mask[:, 5:11, 6:10] = True
+    T = np.stack([look_at(np.array([np.cos(a), np.sin(a), 0.5]), np.zeros(3)) for a in (0, 1, 2, 3)])
+    for name in ("one", "two"):
+        write_instance(tmp_path / "data", Instance(name, 12.0, (8.0, 8.0), (0.0, 0.0, 0.0), 1.0, rgb, mask, T))
+    folder, more = tmp_path / "run", ["--preset", "tiny", "--steps", "10", "--learning-rate", "0.01"]
+    assert main(["train", "--data", str(tmp_path / "data"), "--out", str(folder), *more]) == 0
+    assert trainer.asked["solids"] is None
+    config = TrainConfig(steps=10, learning_rate=0.01, ray_learning_rate=0.01, solid_steps=0)
+    assert trainer.asked["config"] == config
+    views = trainer.asked["views"]
+    np.testing.assert_array_equal(views.range, np.where(np.stack([mask, mask]), NO_RANGE, 0.0))
+    story = load_prior(folder / "prior.safetensors", preset="tiny").metadata
+    assert (story["family"], story["data"], story["objects"]) == ("srn", "data", 2)
+    assert story["recipe"]["solid_steps"] == 0
+    capsys.readouterr()
+    assert main(["train", "--data", str(tmp_path / "none"), "--out", str(tmp_path / "b")]) == 1
+    assert "none does not exist; give a folder of NAME/intrinsics.txt" in capsys.readouterr().err
+    assert main(["train", "--data", str(tmp_path / "data"), "--pictures", "0"]) == 1
+    assert "--pictures is 0; give 1 or more" in capsys.readouterr().err
 
 
 def test_ctrl_c_leaves_the_curves(tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture) -> None:
