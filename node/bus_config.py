@@ -1,0 +1,95 @@
+"""What the bus listens to and whom it admits, and the same as Zenoh's settings."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+_NODE = re.compile(r"[A-Za-z_]\w*", re.ASCII)
+_SPACE = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
+# What one may do who is admitted by his certificate: everything that nodes of ROS 2 do, on this domain alone.
+_MESSAGES = ["put", "delete", "query", "reply", "declare_subscriber", "declare_queryable"]
+_GRAPH = ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
+
+
+@dataclass(frozen=True)
+class BusConfig:
+    """Where the bus listens and whom it admits."""
+
+    domain_id: int = 0
+    namespace: str = "/"
+    name: str = "farside"
+    mode: Literal["peer", "client"] = "peer"  # client: everything goes through the router that it connects to
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)  # protocol/address:port; port 0: any; tls/... needs the files below
+    connect: tuple[str, ...] = ()  # such as tcp/127.0.0.1:7447, the router of ROS 2 on this machine
+    tls_ca: Path | None = None  # certificate authority that both sides' certificates must come from (mutual TLS)
+    tls_certificate: Path | None = None
+    tls_key: Path | None = None
+    allowed: tuple[str, ...] = ()  # common names of the certificates that are admitted; none: all that TLS lets in
+    max_message_bytes: int = 64_000_000
+    max_request_bytes: int = 4_000_000  # of what a service is asked
+    max_rate: float = 200.0  # messages per second of each topic and service, in and out
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.domain_id <= 232:
+            raise ValueError(f"domain_id is {self.domain_id}; give 0 to 232")
+        if min(self.max_message_bytes, self.max_request_bytes) < 1 or not self.max_rate > 0:
+            raise ValueError("max_message_bytes, max_request_bytes and max_rate must be greater than 0")
+        if not _NODE.fullmatch(self.name):
+            raise ValueError(
+                f"name is {self.name!r}; use letters, digits and _ (its namespace is a setting of its own)"
+            )
+        if self.namespace != "/" and not _SPACE.fullmatch(self.namespace):
+            raise ValueError(
+                f"namespace is {self.namespace!r}; give / or parts of letters, digits and _, each after a /"
+            )
+        for endpoint in (*self.listen, *self.connect):
+            protocol, slash, address = endpoint.partition("/")
+            if not slash or protocol not in ("tcp", "tls") or not address.rpartition(":")[2].isdigit():
+                raise ValueError(f"endpoint {endpoint!r} is not tcp/address:port or tls/address:port")
+        files = {"tls_ca": self.tls_ca, "tls_certificate": self.tls_certificate, "tls_key": self.tls_key}
+        encrypted = [e.startswith("tls/") for e in (*self.listen, *self.connect)]
+        if any(encrypted) and (missing := [name for name, path in files.items() if path is None]):
+            raise ValueError(f"a tls endpoint needs {', '.join(files)}; {missing[0]} is missing")
+        if self.allowed and not all(encrypted):
+            raise ValueError("allowed names certificates, so every endpoint must be tls/...; a tcp one shows none")
+        if self.mode == "client" and not self.connect:
+            raise ValueError("mode client needs connect: the router's endpoint, such as tcp/192.0.2.1:7447")
+
+    def settings(self) -> dict[str, Any]:
+        """Zenoh's configuration. Raises FileNotFoundError for a certificate that is not there."""
+        for path in (self.tls_ca, self.tls_certificate, self.tls_key):
+            if path is not None and not path.is_file():
+                raise FileNotFoundError(f"{path}: no such file; give the certificate or key of the bus")
+        settings: dict[str, Any] = {
+            "mode": self.mode,
+            "listen": {"endpoints": list(self.listen) if self.mode == "peer" else []},
+            "connect": {"endpoints": list(self.connect)},
+            # Nobody is sought by multicast. Who is connected says who else is there, as nodes of ROS 2 find each other.
+            "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True}},
+            "timestamping": {"enabled": True},  # which late joiners need
+            # A sender of more than the limit is heard and counted; far beyond it, its connection ends.
+            "transport": {"link": {"rx": {"max_message_size": 2 * self.max_message_bytes + (1 << 20)}}},
+        }
+        if self.tls_key is not None:
+            certificate, own_key = str(self.tls_certificate), str(self.tls_key)
+            settings["transport"]["link"]["tls"] = {
+                "root_ca_certificate": str(self.tls_ca),
+                "enable_mtls": True,
+                "listen_certificate": certificate,
+                "listen_private_key": own_key,
+                "connect_certificate": certificate,
+                "connect_private_key": own_key,
+            }
+        if self.allowed:
+            # `**` does not match what begins with @: tokens of the graph, and those of latched topics.
+            keys = [f"{self.domain_id}/**", f"{self.domain_id}/**/@adv/**", f"@ros2_lv/{self.domain_id}/**"]
+            rule = {"id": "ros", "permission": "allow", "flows": ["ingress", "egress"]}
+            settings["access_control"] = {
+                "enabled": True,
+                "default_permission": "deny",
+                "rules": [rule | {"messages": _MESSAGES + _GRAPH, "key_exprs": keys}],
+                "subjects": [{"id": "allowed", "cert_common_names": list(self.allowed)}],
+                "policies": [{"rules": ["ros"], "subjects": ["allowed"]}],
+            }
+        return settings

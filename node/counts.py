@@ -1,0 +1,52 @@
+"""What became of messages, and how many may come."""
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+
+
+class Counts:
+    """How many messages met which fate, by topic or service: sent, received, dropped, too_large, too_fast, malformed,
+    failed. The first trouble of each kind is said in a line."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say, self._lock = say, threading.Lock()
+        self._counts: dict[str, Counter[str]] = {}
+
+    def add(self, name: str, fate: str, trouble: str = "", count: int = 1) -> None:
+        """Count a fate; `trouble` is said if it is the first of its kind."""
+        with self._lock:
+            counter = self._counts.setdefault(name, Counter())
+            first = counter[fate] == 0
+            counter[fate] += count
+        if first and trouble:
+            self._say(f"{name}: {trouble} (further ones are only counted)")
+
+    def of(self, name: str) -> dict[str, int]:
+        """The counts of one full name."""
+        with self._lock:
+            return dict(self._counts.get(name, {}))
+
+    def all(self) -> dict[str, dict[str, int]]:
+        """The counts by full name."""
+        with self._lock:
+            return {name: dict(counter) for name, counter in self._counts.items()}
+
+
+class Rate:
+    """At most `hz` events per second, in bursts of at most a second's worth."""
+
+    def __init__(self, hz: float) -> None:
+        self._hz, self._left, self._last, self._lock = hz, max(1.0, hz), time.monotonic(), threading.Lock()
+
+    def allows(self) -> bool:
+        """Whether one more may happen now; it counts as happened."""
+        with self._lock:
+            now = time.monotonic()
+            self._left = min(max(1.0, self._hz), self._left + (now - self._last) * self._hz)
+            self._last = now
+            if self._left < 1.0:
+                return False
+            self._left -= 1.0
+            return True

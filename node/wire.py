@@ -1,0 +1,75 @@
+"""How `rmw_zenoh_cpp` names things on Zenoh: keys, liveliness tokens, and the attachment of each sample. Text only."""
+
+import re
+import struct
+from dataclasses import dataclass
+
+from node.xxh3 import xxh3_128
+
+_NAME = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
+_ATTACHMENT = struct.Struct("<qqB16s")
+_DEFAULT_DEPTH = 42  # of rmw_zenoh_cpp's default quality of service, which is left out
+
+
+@dataclass(frozen=True)
+class Node:
+    """Who speaks."""
+
+    domain: int
+    zid: str  # of the session
+    namespace: str  # "/" or "/a/b"
+    name: str
+
+    def resolve(self, name: str) -> str:
+        """The full name of ~/name (the node's own), name (the namespace's) or /name. Raises ValueError for no name."""
+        if not _NAME.fullmatch(name):
+            raise ValueError(f"{name!r} is no ROS name; use letters, digits and _, parts separated by /")
+        space = self.namespace.rstrip("/")
+        if name.startswith("/"):
+            return name
+        return f"{space}/{self.name}/{name[2:]}" if name.startswith("~/") else f"{space}/{name}"
+
+    def token(self, entity: int, code: str, topic: str = "", kind: str = "", type_hash: str = "", qos: str = "") -> str:
+        """The liveliness token of the node (code NN), or its publisher MP, subscriber MS, service SS or client SC."""
+        who = [_mangled(self.namespace), self.name]
+        what = [_mangled(topic), type_name(kind), type_hash, qos] if topic else []
+        return "/".join(["@ros2_lv", str(self.domain), self.zid, "0", str(entity), code, "%", *who, *what])
+
+
+def key(domain: int, name: str, kind: str, type_hash: str) -> str:
+    """The key of a topic or service; `name` is a full one."""
+    return f"{domain}/{name.strip('/')}/{type_name(kind)}/{type_hash}"
+
+
+def type_name(kind: str) -> str:
+    """sensor_msgs/msg/Image as sensor_msgs::msg::dds_::Image_."""
+    package, folder, name = kind.split("/")
+    return f"{package}::{folder}::dds_::{name}_"
+
+
+def quality(depth: int, latched: bool = False) -> str:
+    """Quality of service in a token: reliable, the last `depth` samples, kept for late joiners if `latched`."""
+    return f":{1 if latched else ''}:,{'' if depth == _DEFAULT_DEPTH else depth}:,:,:,,"
+
+
+def gid(token: str) -> bytes:
+    """The 16 bytes that stand for the entity of a token."""
+    low, high = xxh3_128(token.encode())
+    return low.to_bytes(8, "little") + high.to_bytes(8, "little")
+
+
+def attachment(sequence: int, time_ns: int, source: bytes) -> bytes:
+    """What travels beside a sample: its number, when it was sent, and the gid of who sent it."""
+    return _ATTACHMENT.pack(sequence, time_ns, 16, source)
+
+
+def read_attachment(data: bytes) -> tuple[int, int, bytes]:
+    """(sequence, time in ns, gid). Raises ValueError where the bytes are no attachment."""
+    if len(data) != _ATTACHMENT.size or data[16] != 16:
+        raise ValueError(f"the attachment has {len(data)} bytes; rmw_zenoh_cpp sends {_ATTACHMENT.size}")
+    sequence, time_ns, _, source = _ATTACHMENT.unpack(data)
+    return sequence, time_ns, source
+
+
+def _mangled(name: str) -> str:
+    return name.replace("/", "%")
