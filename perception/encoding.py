@@ -1,14 +1,19 @@
 """What image and camera_info messages hold, as arrays. Messages are read by their fields, whoever decoded them."""
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int32, Shaped, UInt8
+from jaxtyping import Float, Float32, Int32, Shaped, UInt8
+from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
 from perception.source import colour_to_rgb
 
+POSE_TOPIC = "/camera/color/pose"  # where a Farside recording keeps T_world_camera (geometry_msgs/PoseStamped)
+MM = np.float32(1e-3)
 # Encoding -> sample type and channels.
 COLOURS = {"rgb8": ("u1", 3), "bgr8": ("u1", 3), "rgba8": ("u1", 4), "bgra8": ("u1", 4), "mono8": ("u1", 1)}
 _ENCODINGS = COLOURS | {"8UC1": ("u1", 1), "mono16": ("u2", 1), "16UC1": ("u2", 1), "32FC1": ("f4", 1)}
@@ -33,6 +38,25 @@ def is_depth(message: Any, topic: str) -> bool:
     return encoding in ("16UC1", "32FC1") or (encoding == "mono16" and "depth" in topic)
 
 
+def is_label(topic: str) -> bool:
+    """Whether a topic's name has a part that says label or segmentation."""
+    return bool({"label", "segmentation"} & set(topic.split("/")))
+
+
+def colour_topic(path: Path, firsts: Mapping[str, Any]) -> str:
+    """Which of these topics of a recording, each with one image of it, is the colour. Raises ValueError for none."""
+    found = [t for t, message in firsts.items() if not is_label(t) and encoding_of(message) in COLOURS]
+    if not found:
+        seen = ", ".join(f"{t} ({encoding_of(message)})" for t, message in firsts.items()) or "none"
+        raise ValueError(f"{path} has no colour image (images: {seen}); record one as {', '.join(COLOURS)} or JPEG")
+
+    def rank(topic: str) -> tuple[bool, bool, bool]:  # infrared is mono8 too; a raw picture needs no decoding
+        named = any(name in topic for name in ("color", "colour", "rgb"))
+        return encoding_of(firsts[topic]) != "mono8", named, hasattr(firsts[topic], "encoding")
+
+    return max(found, key=rank)
+
+
 def to_rgb(message: Any) -> UInt8[np.ndarray, "h w 3"]:
     """A colour image. Raises `ValueError` where the message does not hold one."""
     image = samples(message)
@@ -45,7 +69,7 @@ def to_rgb(message: Any) -> UInt8[np.ndarray, "h w 3"]:
 def to_depth(message: Any) -> Float32[np.ndarray, "h w"]:
     """A depth image in metres (REP 118: integers are millimetres), 0 or NaN where unknown."""
     image = _plane(message)
-    return image * np.float32(1e-3) if image.dtype.kind == "u" else image.astype(np.float32)
+    return image * MM if image.dtype.kind == "u" else image.astype(np.float32)
 
 
 def to_label(message: Any) -> Int32[np.ndarray, "h w"]:
@@ -61,9 +85,20 @@ def to_camera(info: Any, rectified: bool) -> Camera:
     K, D, P = (getattr(info, name if hasattr(info, name) else name.upper()) for name in "kdp")  # ROS 1 wrote K, D, P
     if rectified:
         return Camera(info.width, info.height, np.reshape(P, (3, 4))[:, :3], np.zeros(5))
-    if len(D) == 0:
-        return Camera(info.width, info.height, np.reshape(K, (3, 3)), np.zeros(5))
+    if len(D) == 0:  # no distortion, which a fisheye spells with four zeros
+        fisheye = info.distortion_model in ("equidistant", "fisheye")
+        D, model = (np.zeros(4), "equidistant") if fisheye else (np.zeros(5), "plumb_bob")
+        return Camera(info.width, info.height, np.reshape(K, (3, 3)), D, model)
     return Camera(info.width, info.height, np.reshape(K, (3, 3)), D, info.distortion_model)
+
+
+def to_transform(pose: Any) -> Float[np.ndarray, "4 4"]:
+    """T_frame_thing of a PoseStamped: frame is its header's, thing is what has the pose. `ValueError`: no rotation."""
+    p, q = pose.pose.position, pose.pose.orientation
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+    T[:3, 3] = [p.x, p.y, p.z]
+    return T
 
 
 def samples(message: Any) -> Shaped[np.ndarray, "h w *c"]:

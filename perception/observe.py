@@ -1,6 +1,6 @@
 """From a segment of a frame to what the model conditions on: the object's frame, and rays in its cube."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from calibration.camera import Camera
+from perception.body import visible_body
+from perception.monocular import standing_body
 from perception.plane import heights
 from perception.segment import Segment, backproject
 from perception.source import Frame
@@ -15,7 +17,6 @@ from probnerf.types import BASE_Z, FREE, OBJECT, UNKNOWN, Observation, Rays
 
 # The larger of a body's width and height is this many cube units: the scale convention of the prior.
 BODY_EXTENT = 1.4
-_LOOKS_DOWN = np.radians(8.0)  # the least angle at which the far side of a top is told from its near side
 NO_LIMIT = 1e3  # cube units: a ray that misses the object without an end
 
 
@@ -55,10 +56,19 @@ class ObjectFrame:
     plane: Float[np.ndarray, "4"]  # (n, d): n.p + d = 0 in the camera frame (m)
     xy_sigma: float  # cube units; standard deviation of the axis about the guess
     log_scale_sigma: float
+    along_sigma: float = 0.0  # cube units; of the axis towards the camera (x), on top of xy_sigma
+    sight_sigma: float = 0.0  # without depth: relative error of the distance, which place and size share (`monocular`)
 
     def to_camera(self, points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
         """Cube coordinates to the camera frame (m)."""
         return points * self.half_extent @ self.T_camera_object[:3, :3].T + self.T_camera_object[:3, 3]
+
+    def seen_from(self, T_other_camera: Float[np.ndarray, "4 4"]) -> "ObjectFrame":
+        """The same cube in another camera's frame: p_other = T_other_camera @ p_camera."""
+        R, t = T_other_camera[:3, :3], T_other_camera[:3, 3]
+        normal = R @ self.plane[:3]
+        plane = np.append(normal, self.plane[3] - normal @ t)
+        return replace(self, T_camera_object=T_other_camera @ self.T_camera_object, plane=plane)
 
     def to_cube(self, points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
         """Camera frame (m) to cube coordinates."""
@@ -66,9 +76,13 @@ class ObjectFrame:
 
 
 def observe(
-    frame: Frame, segment: Segment, config: ObserveConfig | None = None, seed: int = 0
+    frame: Frame,
+    segment: Segment,
+    config: ObserveConfig | None = None,
+    seed: int = 0,
+    cube: ObjectFrame | None = None,
 ) -> tuple[Observation, ObjectFrame]:
-    """What one frame says about one object, in rays, and the cube that they live in.
+    """What one frame says about one object, in rays, and the cube that they live in: `cube`, if it is known already.
 
     Rays: `colour_rays` OBJECT pixels (colour, and range where measured), then `free_rays` FREE pixels, then
     `occluder_rays` UNKNOWN pixels with the range up to which they are empty, less two sigma. Each group is well spread
@@ -77,7 +91,7 @@ def observe(
     Raises `ValueError` where the object is outside the tabletop's range of sizes.
     """
     config = config or ObserveConfig()
-    cube = object_frame(frame, segment, config)
+    cube = cube or object_frame(frame, segment, config)
     rng = np.random.default_rng(seed)
     v, u = np.mgrid[: frame.camera.height, : frame.camera.width]
     window = _window(frame.camera, cube, config.cube)
@@ -130,13 +144,16 @@ def observe(
         range_valid=jnp.asarray(measured & (kind == OBJECT)),
         limit=jnp.asarray(limit, jnp.float32),
         pose_sigma=jnp.asarray(
-            [
-                cube.xy_sigma,
-                cube.xy_sigma,
-                cube.log_scale_sigma,
-                config.range_offset_sigma / cube.half_extent,
-                config.plane_sigma / cube.half_extent,
-            ],
+            np.hypot(
+                [
+                    cube.xy_sigma + cube.along_sigma,
+                    cube.xy_sigma,
+                    cube.log_scale_sigma,
+                    config.range_offset_sigma / cube.half_extent,
+                    config.plane_sigma / cube.half_extent,
+                ],
+                calibration_widths(frame.camera, cube),
+            ),
             jnp.float32,
         ),
         colour_count=config.colour_rays,
@@ -144,11 +161,42 @@ def observe(
     return observation, cube
 
 
+def calibration_widths(camera: Camera, cube: ObjectFrame) -> Float[np.ndarray, "5"]:
+    """What an uncertain calibration adds in quadrature to `pose_sigma`; zeros where K_std is not known.
+
+    A point at pixel u and depth z lies sideways at X = z (u - cx) / f. With s = std(f) / f (rms of both axes):
+
+    - dX / X = -df / f: lateral sizes, at a depth that the sensor gives, are uncertain by s. So is the scale.
+    - X at the object itself shifts by X s, and by std(cx) z / f: the axis' place, in both horizontal directions.
+    - One picture shows an object of size S at distance d and one of (1 + s) S at (1 + s) d: angles err by s, and the
+      ranges would tie the size down to better than that. The offset that they share gets s d.
+    The plane is seen by the same rays and errs with the object, so its height gets nothing. Deviations of the
+    distortion are left out, for they are bound up with those of f and c. These are widths of the prior: what the
+    likelihood then says of place and size is said by the stated intrinsics, and narrows all but what the offset frees.
+    """
+    if camera.K_std is None:
+        return np.zeros(5)
+    focal = camera.K[[0, 1], [0, 1]]
+    s = float(np.sqrt(((camera.K_std[[0, 1], [0, 1]] / focal) ** 2).mean()))
+    at = cube.T_camera_object[:3, 3]
+    shift = np.hypot(s * at[:2], camera.K_std[:2, 2] * at[2] / focal) / cube.half_extent  # right, down
+    sideways = float(np.sqrt((shift**2).mean()))
+    return np.array([sideways, sideways, s, s * np.linalg.norm(at) / cube.half_extent, 0.0])
+
+
 def object_frame(frame: Frame, segment: Segment, config: ObserveConfig) -> ObjectFrame:
-    """The cube about a segment's object, from its visible points.
+    """The cube about a segment's object: from its visible points or, without depth, from its outline.
 
     Raises `ValueError` where they are too few, or the object's size is out of range.
     """
+    # Where the outline borders on something nearer, or on the picture's edge, the object goes on unseen.
+    width = config.outline_px
+    hidden = ndimage.binary_dilation(np.pad(segment.occluder, width, constant_values=True), iterations=width)
+    hidden = hidden[width:-width, width:-width]
+    outline = segment.mask & ~ndimage.binary_erosion(segment.mask, border_value=0)
+    extra = config.hidden_sigma * float((hidden & outline).sum() / outline.sum())
+    if frame.depth is None:
+        return _outlined_frame(frame.camera, segment, hidden, extra, config)
     points = backproject(frame)
     core = (segment.status == OBJECT) & np.isfinite(points[..., 2])
     if core.sum() < 10:
@@ -160,29 +208,50 @@ def object_frame(frame: Frame, segment: Segment, config: ObserveConfig) -> Objec
     with np.errstate(invalid="ignore"):
         core |= segment.mask & (np.linalg.norm(points - points[row, column], axis=-1) < config.rim_reach)
     core &= heights(points, segment.plane) > 0.0
-    # Where the outline borders on something nearer, or on the picture's edge, the object goes on unseen.
-    width = config.outline_px
-    hidden = ndimage.binary_dilation(np.pad(segment.occluder, width, constant_values=True), iterations=width)
-    hidden = hidden[width:-width, width:-width]
-    outline = segment.mask & ~ndimage.binary_erosion(segment.mask, border_value=0)
-    share = float((hidden & outline).sum() / outline.sum())
     thin = max(1, core.sum() // 10_000)
     cloud = points[core][::thin]
     up, d = segment.plane[:3], segment.plane[3]
     axes = _axes(up, np.median(cloud, axis=0))
     seen = np.column_stack([cloud @ axes[:2].T, heights(cloud, segment.plane)])
-    centre, across, height, top_seen = _body(seen, hidden[core][::thin], float(d))
+    centre, across, height, top_seen = visible_body(seen, hidden[core][::thin], float(d))
+    foot = centre @ axes[:2] - d * up  # on the plane, where n.p = -d
+    extra += 0.0 if top_seen else config.side_sigma
+    return _frame_about(foot, across, height, segment, extra, config)
+
+
+def _outlined_frame(
+    camera: Camera, segment: Segment, hidden: Bool[np.ndarray, "h w"], extra: float, config: ObserveConfig
+) -> ObjectFrame:
+    """The cube about an object without depth; place and size have the error of the supposed plane, too."""
+    try:
+        body = standing_body(camera, segment.mask, hidden, segment.plane, segment.plane_sigma or (0.0, 0.0))
+    except ValueError as error:
+        raise ValueError(f"object {segment.id}: {error}") from None
+    height = max(body.height, config.min_height)  # of a low box that is taken for a round thing, nothing is left
+    cube = _frame_about(body.foot, body.across, height, segment, extra, config)
+    return replace(
+        cube,
+        xy_sigma=cube.xy_sigma + body.across_sigma,
+        log_scale_sigma=cube.log_scale_sigma + body.log_scale_sigma,
+        along_sigma=body.along_sigma,
+        sight_sigma=body.sight_sigma,
+    )
+
+
+def _frame_about(
+    foot: Float[np.ndarray, "3"], across: float, height: float, segment: Segment, extra: float, config: ObserveConfig
+) -> ObjectFrame:
+    """The cube of a body that stands at `foot` (camera frame, m), `extra` added to its widths."""
     if height < config.min_height or max(across, height) > config.max_side:
         raise ValueError(
             f"object {segment.id} measures {100 * across:.1f} cm across and {100 * height:.1f} cm in height; tabletop"
             f" objects are {100 * config.min_height:g} cm high to {100 * config.max_side:g} cm: give another object"
         )
     half_extent = max(across, height) / BODY_EXTENT
-    foot = centre @ axes[:2] - d * up  # on the plane, where n.p = -d
+    up = segment.plane[:3]
     T = np.eye(4)
     T[:3, :3] = _axes(up, foot).T
     T[:3, 3] = foot - BASE_Z * half_extent * up
-    extra = config.hidden_sigma * share + (0.0 if top_seen else config.side_sigma)
     return ObjectFrame(T, half_extent, segment.plane, config.xy_sigma + extra, config.log_scale_sigma + extra)
 
 
@@ -193,58 +262,6 @@ def _axes(up: Float[np.ndarray, "3"], at: Float[np.ndarray, "3"]) -> Float[np.nd
         x = np.array([0.0, 1.0, 0.0]) - up[1] * up
     x = x / np.linalg.norm(x)
     return np.stack([x, np.cross(up, x), up])
-
-
-def _body(
-    seen: Float[np.ndarray, "n 3"], hidden: Bool[np.ndarray, "n"], camera_height: float
-) -> tuple[Float[np.ndarray, "2"], float, float, bool]:
-    """Horizontal centre, width and height (m) of a body from its visible points (x to the camera, y, height; m).
-
-    Where the camera looks down on the top (the last answer), the top's chords have the axis in their middle, and
-    medians over chords pass over handles and spouts. Where it does not, only the near side is seen, and the axis is
-    half a width behind it, as in a body of revolution. A side that borders on something `hidden` is not the body's end:
-    then the axis is half a width, taken from the top's depth, from the other side.
-    """
-    x, y, z = seen.T
-    height = float(np.percentile(z, 99))
-    low, high, low_cut, high_cut = _extents(y, z, hidden)
-    middle, length = (low + high) / 2, high - low
-    centre_y = float(np.median(middle[length <= np.median(length)]))  # a handle at the side reaches over other heights
-    radius = float(np.percentile(np.minimum(centre_y - low, high - centre_y), 90))  # and over one side alone
-    front = np.abs(y - centre_y) < 0.35 * radius
-    centre_x = float(np.percentile(x[front] if front.any() else x, 95)) - radius
-    width = 2.0 * radius
-    top = z > height - max(0.01, 0.1 * height)
-    top_seen = bool(np.arctan2(camera_height - height, -np.median(x)) > _LOOKS_DOWN and top.sum() > 50)
-    if top_seen:
-        back, near, _, _ = _extents(x[top], y[top], hidden[top])
-        left, right, _, _ = _extents(y[top], x[top], hidden[top])
-        centre_x, centre_y = float(np.median(back + near)) / 2, float(np.median(left + right)) / 2
-        # The longest side whatever its direction: most chords of a box, some of a disc, few of a handle are that long.
-        for angle in np.radians(np.arange(0.0, 180.0, 15.0)):
-            along, over = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
-            start, end, _, _ = _extents(along[top], over[top], hidden[top])
-            width = max(width, float(np.percentile(end - start, 70)))
-    if (low_cut.mean() > 0.4) != (high_cut.mean() > 0.4):
-        at_high = high_cut.mean() > 0.4
-        centre_y = float(np.percentile(low, 30)) + width / 2 if at_high else float(np.percentile(high, 70)) - width / 2
-    return np.array([centre_x, centre_y]), width, height, top_seen
-
-
-def _extents(
-    along: Float[np.ndarray, "n"], over: Float[np.ndarray, "n"], hidden: Bool[np.ndarray, "n"], bins: int = 12
-) -> tuple[Float[np.ndarray, "b"], Float[np.ndarray, "b"], Bool[np.ndarray, "b"], Bool[np.ndarray, "b"]]:
-    """Ends of the points' extent in one coordinate, in equal bins of another, and whether the ends border on hidden."""
-    low, high = np.percentile(over, [1, 99])
-    at = np.floor((over - low) / max(high - low, 1e-9) * bins)
-    rows = []
-    for inside in [at == b for b in range(bins) if (at == b).sum() >= 5] or [at == at]:
-        first, last = np.percentile(along[inside], [1, 99])
-        margin = 0.05 * (last - first)
-        cuts = [hidden[inside & end].mean() > 0.3 for end in (along <= first + margin, along >= last - margin)]
-        rows.append((first, last, *cuts))
-    first, last, first_cut, last_cut = np.array(rows).T
-    return first, last, first_cut > 0, last_cut > 0
 
 
 def _window(camera: Camera, cube: ObjectFrame, half: float) -> tuple[slice, slice]:
@@ -284,36 +301,3 @@ def _spread(
     side = int(np.ptp(pixels[candidates], axis=0).argmax())
     order = candidates[np.argpartition(pixels[candidates, side], cut)]
     return np.append(_spread(pixels, order[:cut], first, rng), _spread(pixels, order[cut:], count - first, rng))
-
-
-def seen_voxels(frame: Frame, cube: ObjectFrame, grid: int = 64) -> Bool[np.ndarray, "grid grid grid"]:
-    """Voxels [i_x, i_y, i_z] of the cube that the camera saw: free before the measured end of their ray, or at it.
-
-    "At it": the centre is at most half a voxel's diagonal behind the surface. Not seen: outside the picture, no depth.
-    """
-    if frame.depth is None:
-        return np.zeros((grid, grid, grid), bool)
-    points, pixels, inside = _voxels(frame.camera, cube, grid)
-    z = frame.depth[pixels[:, 1], pixels[:, 0]]
-    distance = np.linalg.norm(points, axis=1)
-    half_diagonal = np.sqrt(3.0) / grid * cube.half_extent
-    with np.errstate(invalid="ignore"):
-        seen = inside & (distance * (1.0 - z / points[:, 2]) <= half_diagonal)
-    return seen.reshape(grid, grid, grid)
-
-
-def inside_view(camera: Camera, cube: ObjectFrame, grid: int = 64) -> Bool[np.ndarray, "grid grid grid"]:
-    """Voxels [i_x, i_y, i_z] of the cube whose centre falls inside the picture."""
-    return _voxels(camera, cube, grid)[2].reshape(grid, grid, grid)
-
-
-def _voxels(
-    camera: Camera, cube: ObjectFrame, grid: int
-) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
-    """Voxel centres in the camera frame (m), the pixel each falls in (clipped), and whether that is in the picture."""
-    ticks = -1.0 + (np.arange(grid) + 0.5) * 2.0 / grid
-    points = cube.to_camera(np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3))
-    px = np.round(np.nan_to_num(camera.project(points), nan=-1.0))
-    size = np.array([camera.width, camera.height])
-    inside = ((px >= 0) & (px < size)).all(axis=1)
-    return points, np.clip(px, 0, size - 1).astype(np.intp), inside

@@ -1,4 +1,7 @@
-"""Objects in a frame: their masks, the plane each stands on, and what every pixel says about each of them."""
+"""Objects in a frame: their masks, the plane each stands on, and what every pixel says about each of them.
+
+With depth the plane is measured. Without, it is supposed (`PlaneGuess`) and colour finds the objects (`MaskConfig`).
+"""
 
 from dataclasses import dataclass, field
 
@@ -9,6 +12,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from perception.mask import MaskConfig, label_colour
+from perception.monocular import PlaneGuess, slopes, supposed_plane
 from perception.plane import PlaneConfig, heights, horizontal, noise_growth, over, support_plane
 from perception.source import Frame
 from probnerf.types import FREE, OBJECT, UNKNOWN
@@ -31,6 +36,8 @@ class SegmentConfig:
     min_pixels: int = 50  # a smaller mask says nothing about a shape
     min_cluster_pixels: int = 200
     rim: int = 2  # px each side of a mask's outline that say nothing: mixed pixels, misregistered depth
+    mask: MaskConfig = field(default_factory=MaskConfig)  # without depth
+    guess: PlaneGuess = field(default_factory=PlaneGuess)  # without depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +49,7 @@ class Segment:
     plane: Float[np.ndarray, "4"]  # (n, d): n.p + d = 0 in the camera frame, n unit and up, d the camera's height (m)
     status: Int[np.ndarray, "h w"]  # OBJECT, FREE or UNKNOWN (probnerf.types)
     occluder: Bool[np.ndarray, "h w"]  # UNKNOWN pixels that see something else: their ray is free up to its depth
+    plane_sigma: tuple[float, float] | None = None  # m, rad; of the height and tilt of a supposed plane; None: measured
 
 
 def segment(frame: Frame, object_id: int | None = None, config: SegmentConfig | None = None) -> list[Segment]:
@@ -52,13 +60,19 @@ def segment(frame: Frame, object_id: int | None = None, config: SegmentConfig | 
     is on or below the support plane, or beyond the object, or absent where the label map says background; UNKNOWN
     otherwise: nearer things, pixels without depth, the rim of the mask, mask pixels whose depth is the background's.
 
-    Raises `ValueError` where there is no depth, no plane, no such id, or a mask of a few pixels. Without `object_id`
-    masks that are too small are passed over, unless none is left.
+    Without depth FREE is all that is not in the mask or next to it, save other masks that may be of things before the
+    object: what is in no mask is taken to be behind.
+
+    Raises `ValueError` where there is no plane, no such id, or a mask of a few pixels. Without `object_id` masks that
+    are too small are passed over, unless none is left.
     """
     config = config or SegmentConfig()
     where = f"frame at {frame.stamp_ns} ns"
     if frame.depth is None:
-        raise ValueError(f"{where} has no depth, and objects need the plane they stand on; record depth too")
+        try:
+            return _segment_colour(frame, object_id, config)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
     if not np.isfinite(frame.depth).any():
         raise ValueError(f"{where}: depth is NaN in all {frame.depth.size} pixels; check the depth sensor")
     points = backproject(frame)
@@ -88,6 +102,62 @@ def segment(frame: Frame, object_id: int | None = None, config: SegmentConfig | 
     if not segments:
         raise ValueError(f"{where} has no object with {config.min_pixels} pixels of depth; move the camera nearer")
     return segments
+
+
+def _segment_colour(frame: Frame, object_id: int | None, config: SegmentConfig) -> list[Segment]:
+    """The objects of a frame without depth. Raises as `segment`, without the name of the frame."""
+    label = label_colour(frame, config.mask)
+    ids = [int(i) for i in np.unique(label) if i > 0]
+    if config.mask.box_px is not None:  # the other boxes are no objects to infer
+        ids = [1]
+    if not ids or object_id not in (None, *ids):
+        raise ValueError(f"no object {object_id or 'to infer'}; its objects: {', '.join(map(str, ids)) or 'none'}")
+    ids = [i for i in ids if object_id in (None, i)]
+    plane = supposed_plane(frame, config.guess)
+    v, u = np.mgrid[: label.shape[0], : label.shape[1]]
+    slope = slopes(frame.camera.rays(np.column_stack([u.ravel(), v.ravel()])), plane).reshape(label.shape)
+    band = config.rim if config.mask.box_px is None and config.mask.background is None else config.mask.band
+    sigma = (config.guess.height_sigma, float(np.radians(config.guess.tilt_sigma)))
+    segments = []
+    for i in ids:
+        mask = label == i
+        grown, core = _around(mask, band)
+        front = _may_stand_before(label, i, slope, frame.camera.K[0, 0])
+        front = ndimage.binary_dilation(front, _SQUARE, iterations=band) & ~grown if front.any() else front
+        status = np.where(core, OBJECT, np.where(grown | front, UNKNOWN, FREE)).astype(np.int32)
+        if core.sum() >= config.min_pixels:
+            segments.append(Segment(i, mask, plane, status, front, sigma))
+        elif len(ids) == 1:
+            raise ValueError(
+                f"object {i} has {core.sum()} pixels inside its outline; at least {config.min_pixels} are needed: move"
+                " the camera nearer or give another object"
+            )
+    if not segments:
+        raise ValueError(f"no object has {config.min_pixels} pixels inside its outline; move the camera nearer")
+    return segments
+
+
+def _may_stand_before(
+    label: Int[np.ndarray, "h w"], object_id: int, slope: Float[np.ndarray, "h w"], focal: float
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels of other things that may hide an object: their lowest visible point is nearer on the plane than its back.
+
+    Its back is as far behind its foot as it is wide: sin(alpha) = R / D for half its width (`monocular`). What hides a
+    foot is nearer than what shows above it, so that this holds of hidden feet, too.
+    """
+    own = label == object_id
+    lowest = float(np.nanpercentile(slope[own], 99.5))
+    half_width = 0.5 * np.ptp(np.flatnonzero(own.any(axis=0))) / focal * np.hypot(1.0, lowest)
+    sine = np.sin(min(half_width, 1.5))
+    back = lowest * (1.0 - sine) / (1.0 + sine)
+    others = [i for i in np.unique(label) if i > 0 and i != object_id]
+    return np.isin(label, [i for i in others if np.nanpercentile(slope[label == i], 99.5) > back])
+
+
+def _around(mask: Bool[np.ndarray, "h w"], width: int) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """A mask grown, and shrunk, by `width` px; the picture's border is no outline."""
+    grown = ndimage.binary_dilation(mask, _SQUARE, iterations=width)
+    return grown, ndimage.binary_erosion(mask, _SQUARE, iterations=width, border_value=1)
 
 
 def backproject(frame: Frame) -> Float[np.ndarray, "h w 3"]:
@@ -258,7 +328,6 @@ def _statuses(
     else:
         status[mask & ~elsewhere] = OBJECT
         status[~measured & (label == 0)] = FREE
-    grown = ndimage.binary_dilation(mask, _SQUARE, iterations=config.rim)
-    core = ndimage.binary_erosion(mask, _SQUARE, iterations=config.rim, border_value=1)
+    grown, core = _around(mask, config.rim)
     status[grown & ~core] = UNKNOWN
     return status, (status == UNKNOWN) & ~grown & measured

@@ -1,11 +1,12 @@
-"""Where frames come from: the Frame itself, the frame folder, and the choice between folder and log."""
+"""Where frames come from: the Frame itself, the frame folder, and the choice of a source by what names it."""
 
 import json
+import os
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -15,6 +16,13 @@ from calibration.camera import Camera
 
 # The recording that ships with the project, read when no source is named.
 SHIPPED_LOG = Path(__file__).parent / "shipped.mcap"
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
+# What a source may be, for messages.
+SOURCES = (
+    "oak, oak:ID, webcam:N, a video file (.mp4, .avi, .mkv), a frame folder (color.png, depth.png, meta.json)"
+    " or a recording (.mcap, .bag, ROS 2 bag folder)"
+)
+DEPTH_UNIT_M = 1e-4  # of the depth.png that is written; 1 mm where that does not reach far enough
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 
 
@@ -55,10 +63,19 @@ class Frame:
 
 
 class Source(Protocol):
-    """Frames in time order, once or more, and notes about what was missing (final when the iteration has ended)."""
+    """Frames in time order, once or more, and notes about what was missing (final when the iteration has ended).
+
+    Of a `live` source the frames come when the camera takes them, and go on until `close`, from whatever thread, ends
+    the iteration under way and lets the device go; then it is over. A source that is not live need not be closed.
+    """
+
+    @property
+    def live(self) -> bool: ...
 
     @property
     def notes(self) -> list[str]: ...
+
+    def close(self) -> None: ...
 
     def __iter__(self) -> Iterator[Frame]: ...
 
@@ -69,44 +86,71 @@ class StillSource:
 
     frames: tuple[Frame, ...]
     notes: list[str] = field(default_factory=list)
+    live = False
+
+    def close(self) -> None:
+        """Nothing to let go."""
 
     def __iter__(self) -> Iterator[Frame]:
         return iter(self.frames)
 
 
-def open_source(path: Path | str | None) -> Source:
-    """The source at `path`: a frame folder (it holds color.png), else a log; None is the log shipped with the project.
+def open_source(path: Path | str | None, camera: Camera | None = None) -> Source:
+    """The source that `path` names; None is the log shipped with the project.
 
-    Raises `FileNotFoundError` or `ValueError` with one line that names the file and the remedy.
+    `oak` or `oak:ID` is an OAK camera, `webcam:N` the camera /dev/videoN; else a video file (by its suffix), a frame
+    folder (it holds color.png) or a log. A file of such a name is given as ./oak. `camera` is the calibration for a
+    webcam or a video file, or in place of what an OAK camera, a log or a frame folder states; it must be of the size of
+    the images.
+
+    Raises `FileNotFoundError`, `OSError` or `ValueError` with one line that names file or device and the remedy.
     """
+    kind, _, which = str(path).partition(":")
+    if kind == "oak":
+        from perception.oak import open_oak  # here, because depthai takes a second to import
+
+        return open_oak(which, camera)
+    if kind == "webcam":
+        from perception.webcam import Webcam  # here, because webcam.py makes Frames
+
+        return Webcam(which, camera)
     path = SHIPPED_LOG if path is None else Path(path)
-    if (path / "color.png").exists() or (path / "meta.json").exists():
-        return StillSource((read_frame_folder(path),))
-    if not path.exists():
-        raise FileNotFoundError(
-            f"{path} does not exist; give a frame folder (color.png, depth.png, meta.json)"
-            " or a recording (.mcap, .bag, ROS 2 bag folder)"
-        )
+    is_folder = (path / "color.png").exists() or (path / "meta.json").exists()
+    if not is_folder and not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; give {SOURCES}")
+    if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file():
+        from perception.webcam import VideoFile
+
+        return VideoFile(path, camera)
+    if is_folder:
+        frame = read_frame_folder(path)
+        try:
+            return StillSource((frame if camera is None else replace(frame, camera=camera),))
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
     from perception.log import Log  # here, because log.py makes Frames; and a folder needs no log libraries
 
-    return Log(path)
+    return Log(path, camera=camera)
 
 
 def read_frame_folder(path: Path | str) -> Frame:
-    """The frame in a folder: color.png, depth.png (16 bit, 0 for unknown), meta.json, and label.png where there is one.
+    """The frame in a folder: color.png, meta.json, and depth.png (16 bit, 0 for unknown) and label.png where they are.
 
-    meta.json gives `camera_matrix_px` (3x3) and `depth_unit_m` (m per count); whatever else it holds is not read.
-    The stamp is 0: a folder has no time. Raises `FileNotFoundError` or `ValueError` naming the file and the remedy.
+    meta.json gives `camera_matrix_px` (3x3) and `depth_unit_m` (m per count), and may give `distortion` and
+    `distortion_model` (as `Camera`; none by default), `stamp_ns` (0), `frame_id` ("camera") and `T_world_camera` (4x4,
+    m); whatever else it holds is not read. With neither depth.png nor depth_unit_m it is a frame without depth. Raises
+    `FileNotFoundError` or `ValueError` naming the file and the remedy.
     """
     path = Path(path)
-    K, unit = _read_meta(path / "meta.json")
+    meta = _read_meta(path / "meta.json", depth=(path / "depth.png").exists())
+    unit = meta.get("depth_unit_m")
     colour = read_png(path / "color.png")
     if colour.dtype != np.uint8:
         raise ValueError(f"{path / 'color.png'} has {colour.dtype} samples; save it with 8 bits a channel")
     rgb = colour_to_rgb(colour)
     height, width = rgb.shape[:2]
-    counts = read_png(path / "depth.png")
-    if counts.dtype != np.uint16 or counts.ndim != 2:
+    counts = None if unit is None else read_png(path / "depth.png")
+    if counts is not None and (counts.dtype != np.uint16 or counts.ndim != 2):
         raise ValueError(f"{path / 'depth.png'} is {counts.dtype}{list(counts.shape)}; save one channel of 16 bits")
     label = read_png(path / "label.png") if (path / "label.png").exists() else None
     if label is not None and label.ndim != 2:
@@ -117,12 +161,63 @@ def read_frame_folder(path: Path | str) -> Frame:
                 f"{path / name} is {image.shape[1]}x{image.shape[0]} px but color.png is {width}x{height};"
                 f" align {name} to color.png"
             )
-    depth = (counts * np.float64(unit)).astype(np.float32)  # Frame turns 0 into NaN
+    depth = None if counts is None else (counts * np.float64(unit)).astype(np.float32)  # Frame turns 0 into NaN
     try:
-        camera = Camera(width, height, K, np.zeros(5))
+        camera = Camera(width, height, meta["camera_matrix_px"], meta["distortion"], meta["distortion_model"])
     except ValueError as error:
         raise ValueError(f"{path / 'meta.json'}: {error}") from None
-    return Frame(0, "camera", rgb, depth, None if label is None else label.astype(np.int32), camera)
+    label = None if label is None else label.astype(np.int32)
+    return Frame(meta["stamp_ns"], meta["frame_id"], rgb, depth, label, camera, meta["T_world_camera"])
+
+
+def write_frame_folder(path: Path | str, frame: Frame) -> None:
+    """Write a frame as the folder that `read_frame_folder` reads, over an earlier one.
+
+    All comes back as it was, but depth only to within half a count of 0.1 mm (1 mm beyond 6.5 m). meta.json goes first
+    and comes last, so that a folder that was not finished is not read. Raises `ValueError` for ids that a label.png
+    cannot hold.
+    """
+    path = Path(path)
+    if frame.label is not None and not 0 <= frame.label.min() <= frame.label.max() <= 65535:
+        raise ValueError(f"object id {int(frame.label.max())} does not fit label.png; use 0 to 65535")
+    depth = unit = None
+    if frame.depth is not None:
+        metres = np.nan_to_num(frame.depth.astype(np.float64))
+        unit = DEPTH_UNIT_M if metres.max() <= 65535 * DEPTH_UNIT_M else 10 * DEPTH_UNIT_M
+        depth = np.minimum(np.rint(metres / unit), 65535).astype(np.uint16)
+    images = {
+        "color.png": frame.rgb[..., ::-1],
+        "depth.png": depth,
+        "label.png": None if frame.label is None else frame.label.astype(np.uint16),
+    }
+    meta = {
+        "camera_matrix_px": frame.camera.K.tolist(),
+        "distortion": frame.camera.distortion.tolist(),
+        "distortion_model": frame.camera.model,
+        "stamp_ns": int(frame.stamp_ns),
+        "frame_id": frame.frame_id,
+    }
+    if unit is not None:
+        meta["depth_unit_m"] = unit
+    if frame.T_world_camera is not None:
+        meta["T_world_camera"] = np.asarray(frame.T_world_camera, np.float64).tolist()
+    path.mkdir(parents=True, exist_ok=True)
+    for name in ("meta.json", *images):
+        (path / name).unlink(missing_ok=True)
+    for name, image in images.items():
+        if image is not None:
+            _replace(path / name, cv2.imencode(".png", image)[1].tobytes())
+    _replace(path / "meta.json", json.dumps(meta, indent=1).encode())
+
+
+def _replace(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_bytes(data)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def read_png(path: Path) -> Shaped[np.ndarray, "h w *c"]:
@@ -156,8 +251,8 @@ def colour_to_rgb(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w 
     return np.ascontiguousarray(image[:, :, 2::-1])
 
 
-def _read_meta(path: Path) -> tuple[Float[np.ndarray, "3 3"], float]:
-    """camera_matrix_px and depth_unit_m."""
+def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
+    """meta.json, its keys checked, and what it may leave out filled in; depth_unit_m where there is `depth`."""
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
@@ -165,12 +260,31 @@ def _read_meta(path: Path) -> tuple[Float[np.ndarray, "3 3"], float]:
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not JSON ({error}); write it again") from None
     for key in ("camera_matrix_px", "depth_unit_m"):
-        if not isinstance(meta, dict) or key not in meta:
+        if not isinstance(meta, dict) or (key not in meta and (depth or key != "depth_unit_m")):
             raise ValueError(f"{path} has no {key}; add it (3x3 in px, and metres per count of depth.png)")
-    unit = meta["depth_unit_m"]
-    if isinstance(unit, bool) or not isinstance(unit, int | float) or not 0 < unit <= 1:
+    unit = meta.get("depth_unit_m")
+    number = isinstance(unit, int | float) and not isinstance(unit, bool)
+    if "depth_unit_m" in meta and not (number and 0 < unit <= 1):
         raise ValueError(f"{path}: depth_unit_m is {unit!r}; give metres per count, such as 0.001")
+    optional = {"distortion": [0.0] * 5, "distortion_model": "plumb_bob", "stamp_ns": 0, "frame_id": "camera"}
+    meta = {**optional, "T_world_camera": None, **meta}
+    for key, default in optional.items():
+        if isinstance(meta[key], bool) or not isinstance(meta[key], type(default)):
+            raise ValueError(f"{path}: {key} is {meta[key]!r}; give something like {default!r}, or leave it out")
+    meta["camera_matrix_px"] = _numbers(path, "camera_matrix_px", meta["camera_matrix_px"], (3, 3))
+    meta["distortion"] = _numbers(path, "distortion", meta["distortion"], (len(meta["distortion"]),))
+    if (T := meta["T_world_camera"]) is not None:
+        meta["T_world_camera"] = _numbers(path, "T_world_camera", T, (4, 4))
+        if not np.allclose(meta["T_world_camera"][3], [0, 0, 0, 1]):
+            raise ValueError(f"{path}: T_world_camera has last row {T[3]}; it must be 0 0 0 1 (is it transposed?)")
+    return meta
+
+
+def _numbers(path: Path, key: str, value: object, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
     try:
-        return np.array(meta["camera_matrix_px"], dtype=np.float64), float(unit)
+        array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{path}: camera_matrix_px {meta['camera_matrix_px']!r} is not 3 rows of 3 numbers") from None
+        array = np.array(np.nan)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"{path}: {key} {value!r} is not {' rows of '.join(map(str, shape))} finite numbers")
+    return array

@@ -12,7 +12,8 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from calibration.camera import Camera
-from perception.log import Log, write_log
+from perception.log import Log
+from perception.record import write_log
 from perception.source import Frame, open_source
 
 REAL = Path(__file__).parents[2] / "../shared/data/ros1_bag/aruco_images.bag"
@@ -121,6 +122,18 @@ def maker(kind: str) -> Any:
 MS = 1_000_000
 RGB = np.random.default_rng(1).integers(0, 256, (48, 64, 3), dtype=np.uint8)
 MM = np.random.default_rng(2).integers(0, 4000, (48, 64), dtype=np.uint16)
+
+
+def test_a_given_calibration_needs_no_camera_info(tmp_path: Path) -> None:
+    make = maker("mcap")
+    messages = [make.image("/cam/color/image", 10, RGB, "rgb8"), make.image("/cam/depth/image", 10, MM, "16UC1")]
+    bare = record(tmp_path / "bare", "mcap", messages)
+    told = record(tmp_path / "told", "mcap", [make.info(5), *messages])
+    for log in (open_source(bare, CAMERA), Log(told, camera=CAMERA)):
+        (frame,) = log
+        assert frame.camera is CAMERA and np.array_equal(frame.rgb, RGB) and frame.depth is not None
+    (frame,) = Log(told)
+    assert frame.camera.K[0, 0] == 90.0
 
 
 @pytest.mark.parametrize("label", [True, False])

@@ -1,14 +1,18 @@
 """Rays in the cube agree with the cylinder that the picture was made of; what was not seen says nothing."""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from perception.observe import BODY_EXTENT, ObjectFrame, ObserveConfig, inside_view, observe, seen_voxels
+from perception.controller import estimate
+from perception.observe import BODY_EXTENT, ObjectFrame, ObserveConfig, calibration_widths, object_frame, observe
+from perception.seen import inside_view, seen_voxels
 from perception.segment import Segment, segment
 from perception.source import Frame, read_frame_folder
+from probnerf.store import load_prior
 from probnerf.types import BASE_Z, FREE, OBJECT, UNKNOWN, Observation
 from tests.perception.cylinders import CAN, Cylinder, looking_down, picture, to_camera, to_world
 
@@ -216,8 +220,8 @@ def centres(cube: ObjectFrame, T: np.ndarray, grid: int = 64) -> np.ndarray:
 
 
 def test_seen_is_before_the_surface_and_not_behind() -> None:
-    frame, _, _, cube, T = seen(CAN, noise=0.0)
-    voxels = seen_voxels(frame, cube)
+    frame, found, _, cube, T = seen(CAN, noise=0.0)
+    voxels = seen_voxels(frame, found, cube)
     assert voxels.shape == (64, 64, 64) and voxels.dtype == bool
     assert inside_view(frame.camera, cube).all()
     world = centres(cube, T)
@@ -238,11 +242,10 @@ def test_seen_is_before_the_surface_and_not_behind() -> None:
 
 
 def test_nothing_is_seen_without_depth_or_outside_the_picture() -> None:
-    frame, _, _, cube, _ = seen(CAN)
-    assert not seen_voxels(replace(frame, depth=np.full_like(frame.depth, np.nan)), cube).any()
-    assert not seen_voxels(replace(frame, depth=None), cube).any()
+    frame, found, _, cube, _ = seen(CAN)
+    assert not seen_voxels(replace(frame, depth=np.full_like(frame.depth, np.nan)), found, cube).any()
     aside = replace(cube, T_camera_object=cube.T_camera_object + np.outer([5.0, 0, 0, 0], [0, 0, 0, 1]))
-    assert not inside_view(frame.camera, aside).any() and not seen_voxels(frame, aside).any()
+    assert not inside_view(frame.camera, aside).any() and not seen_voxels(frame, found, aside).any()
 
 
 def test_the_real_frame(shared_data: Path) -> None:
@@ -254,4 +257,59 @@ def test_the_real_frame(shared_data: Path) -> None:
     hits = ends(observation, observation.range)[np.asarray(observation.range_valid)]
     radius = np.linalg.norm(hits[:, :2], axis=1) * cube.half_extent
     assert np.percentile(radius, 95) < 0.060  # 5.1 cm, and the guess of its axis
-    assert 0.1 < seen_voxels(frame, cube).mean() < 0.9
+    assert 0.1 < seen_voxels(frame, can, cube).mean() < 0.9
+
+
+def uncertain(frame: Frame, share: float) -> Frame:
+    """The same frame, the focal length and principal point uncertain by a share of the focal length."""
+    f = share * frame.camera.K[0, 0]
+    return replace(frame, camera=replace(frame.camera, K_std=np.array([[f, 0, f], [0, f, f], [0, 0, 0]])))
+
+
+def test_a_worse_calibration_widens_the_pose_prior() -> None:
+    frame, found, exact, cube, _ = seen(CAN)
+    widths = [np.asarray(observe(uncertain(frame, s), found, CONFIG)[0].pose_sigma) for s in (0.0, 0.01, 0.1)]
+    np.testing.assert_array_equal(widths[0], exact.pose_sigma)
+    for narrow, wide in pairwise(widths):
+        assert (wide[:4] > narrow[:4]).all() and wide[4] == narrow[4]
+    # Of a camera whose size errs by a tenth at 0.7 m, the size and the ranges do.
+    assert widths[2][2] == pytest.approx(np.hypot(exact.pose_sigma[2], 0.1), rel=1e-6)
+    metres = 0.1 * np.linalg.norm(cube.T_camera_object[:3, 3])
+    assert widths[2][3] * cube.half_extent == pytest.approx(np.hypot(0.005, metres), rel=1e-6)
+
+
+def test_a_wrong_focal_length_errs_as_the_widths_say() -> None:
+    frame, _, _, cube, _ = seen(WIDE, noise=0.0)
+    share = 0.02
+    widths = calibration_widths(uncertain(frame, share).camera, cube)
+    wrong = replace(
+        frame, camera=replace(frame.camera, K=frame.camera.K * [[1 + share, 1, 1], [1, 1 + share, 1], [1, 1, 1]])
+    )
+    (again,) = segment(wrong, 1)
+    other = object_frame(wrong, again, CONFIG)
+    # The size is measured across and along the view; only what is across errs by the whole width.
+    assert 0.3 * widths[2] < np.log(cube.half_extent / other.half_extent) < 1.05 * widths[2]
+    # A principal point that errs by as much moves it sideways (y of the cube) and nothing else.
+    moved = replace(frame.camera, K=frame.camera.K + share * 310.0 * np.array([[0, 0, 1], [0, 0, 0], [0, 0, 0]]))
+    (again,) = segment(replace(frame, camera=moved), 1)
+    other = object_frame(replace(frame, camera=moved), again, CONFIG)
+    aside = np.abs(cube.to_cube(other.T_camera_object[:3, 3]))
+    assert aside[1] == pytest.approx(widths[1], rel=0.2) and other.half_extent == pytest.approx(
+        cube.half_extent, rel=0.01
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_a_worse_calibration_gives_a_less_certain_posterior() -> None:
+    frame, found, _, _, _ = seen(CAN)
+    prior = load_prior(None)
+    spread, doubt = [], []
+    for share in (0.0, 0.1):
+        h = estimate(uncertain(frame, share), found, prior, stages=2).hypotheses
+        log_scale = h.pose[:, 3]
+        spread.append(float(np.sqrt(h.weights @ (log_scale - h.weights @ log_scale) ** 2)))
+        p = np.tensordot(h.weights, h.solid, axes=1)
+        doubt.append(float((p * (1.0 - p)).mean()))
+    assert spread[1] > 1.15 * spread[0]  # of the size
+    assert doubt[1] > 1.3 * doubt[0]  # of what is occupied

@@ -148,7 +148,7 @@ def test_what_cannot_be_segmented_is_named() -> None:
     few = replace(frame, label=np.where(np.cumsum(frame.label == 1).reshape(frame.label.shape) <= 20, frame.label, 0))
     noise = np.random.default_rng(0).uniform(0.3, 3.0, frame.depth.shape)
     cases = [
-        (replace(frame, depth=None), None, "no depth"),
+        (replace(frame, depth=None), None, "without depth the plane"),
         (blank(frame, everywhere), None, "NaN in all 76800 pixels"),
         (frame, 7, "no object 7; its objects: 1"),
         (replace(frame, label=None), 7, "no object 7; its objects: 1"),

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.camera import Camera
-from perception.source import Frame, open_source, read_frame_folder
+from perception.source import Frame, open_source, read_frame_folder, write_frame_folder
 
 REAL = Path(__file__).parents[2] / "../shared/data/ycbv_000002"
 K = [[500.0, 0.0, 32.0], [0.0, 500.0, 24.0], [0.0, 0.0, 1.0]]
@@ -56,6 +57,13 @@ def test_the_label_is_optional(folder: Path) -> None:
     assert read_frame_folder(folder).label is None
 
 
+def test_a_folder_that_knows_of_no_depth_is_a_frame_without(folder: Path) -> None:
+    (folder / "depth.png").unlink()
+    (folder / "meta.json").write_text(json.dumps({"camera_matrix_px": K}))
+    frame = read_frame_folder(folder)
+    assert frame.depth is None and frame.label is not None and frame.rgb.shape == (48, 64, 3)
+
+
 @pytest.mark.parametrize("name", ["color.png", "depth.png", "meta.json"])
 def test_a_missing_file_is_named(folder: Path, name: str) -> None:
     (folder / name).unlink()
@@ -100,6 +108,17 @@ def test_eight_bit_depth_is_refused(folder: Path) -> None:
         ({"camera_matrix_px": [[1, 2], [3]], "depth_unit_m": 0.001}, "camera_matrix_px"),
         ({"camera_matrix_px": [[float("nan")] * 3] * 3, "depth_unit_m": 0.001}, "finite"),
         ([], "camera_matrix_px"),
+        ({"camera_matrix_px": K, "depth_unit_m": 0.001, "distortion": 0.1}, "distortion is 0.1"),
+        ({"camera_matrix_px": K, "depth_unit_m": 0.001, "distortion": [0.1]}, "4 or 5 finite numbers wanted"),
+        ({"camera_matrix_px": K, "depth_unit_m": 0.001, "distortion": ["k", 0, 0, 0]}, "not 4 finite numbers"),
+        ({"camera_matrix_px": K, "depth_unit_m": 0.001, "distortion_model": "barrel"}, "'barrel' is unknown"),
+        ({"camera_matrix_px": K, "depth_unit_m": 0.001, "stamp_ns": "now"}, "stamp_ns is 'now'"),
+        ({"camera_matrix_px": K, "depth_unit_m": 0.001, "frame_id": None}, "frame_id is None"),
+        ({"camera_matrix_px": K, "depth_unit_m": 0.001, "T_world_camera": K}, "4 rows of 4 finite numbers"),
+        (
+            {"camera_matrix_px": K, "depth_unit_m": 0.001, "T_world_camera": [[0, 0, 0, 1]] * 3 + [[1, 2, 3, 1]]},
+            "transp",
+        ),
     ],
 )
 def test_a_wrong_meta_is_named(folder: Path, meta: object, says: str) -> None:
@@ -110,6 +129,61 @@ def test_a_wrong_meta_is_named(folder: Path, meta: object, says: str) -> None:
 def test_meta_that_is_not_json_is_named(folder: Path) -> None:
     (folder / "meta.json").write_text("{")
     fails(folder, "meta.json", "not JSON")
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_frame_comes_back_as_it_was_written(tmp_path: Path, known: bool) -> None:
+    """Depth in whole tenths of a millimetre, and all else, exactly; other depth to half of a tenth."""
+    rng = np.random.default_rng(1)
+    counts = rng.integers(0, 65536, (48, 64)) * (rng.random((48, 64)) > 0.3)
+    T = np.eye(4)
+    T[:3, 3] = rng.normal(size=3)
+    lens = rng.normal(size=8) / 3
+    frame = Frame(
+        stamp_ns=1_790_000_000_123_456_789 if known else 0,
+        frame_id="left" if known else "camera",
+        rgb=rng.integers(0, 256, (48, 64, 3), dtype=np.uint8),
+        depth=(counts * 1e-4).astype(np.float32),
+        label=rng.integers(0, 300, (48, 64)) if known else None,
+        camera=Camera(64, 48, np.array(K) / 3 + np.diag([0, 0, 2 / 3]), lens, "rational_polynomial")
+        if known
+        else Camera(64, 48, np.array(K), np.zeros(5)),
+        T_world_camera=T if known else None,
+    )
+    (tmp_path / "label.png").write_bytes(b"of an earlier frame")
+    write_frame_folder(tmp_path, frame)
+    back = read_frame_folder(tmp_path)
+    for name in ("stamp_ns", "frame_id", "rgb", "depth", "label", "T_world_camera"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(frame, name), err_msg=name)
+    for name in ("width", "height", "K", "distortion", "model"):
+        np.testing.assert_array_equal(getattr(back.camera, name), getattr(frame.camera, name), err_msg=name)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["color.png", "depth.png"] + ["label.png"] * known + [
+        "meta.json"
+    ]
+    odd = replace(frame, depth=rng.uniform(0.3, 6.0, (48, 64)).astype(np.float32))
+    write_frame_folder(tmp_path, odd)
+    np.testing.assert_allclose(read_frame_folder(tmp_path).depth, odd.depth, rtol=0, atol=0.51e-4)
+
+
+def test_far_depth_is_kept_far(tmp_path: Path) -> None:
+    depth = np.full((48, 64), 20.0, np.float32)
+    depth[0, 0] = 100.0
+    frame = Frame(0, "camera", np.zeros((48, 64, 3), np.uint8), depth, None, Camera(64, 48, np.array(K), np.zeros(5)))
+    write_frame_folder(tmp_path, frame)
+    back = read_frame_folder(tmp_path).depth
+    assert back[0, 0] == pytest.approx(65.535) and (back.ravel()[1:] == np.float32(20.0)).all()
+
+
+def test_what_a_folder_cannot_hold_is_refused(tmp_path: Path) -> None:
+    camera = Camera(64, 48, np.array(K), np.zeros(5))
+    frame = Frame(7, "c", np.zeros((48, 64, 3), np.uint8), None, None, camera)
+    write_frame_folder(tmp_path / "without", frame)
+    back = read_frame_folder(tmp_path / "without")
+    assert back.depth is None and back.stamp_ns == 7
+    many = replace(frame, depth=np.ones((48, 64), np.float32), label=np.full((48, 64), 70_000))
+    with pytest.raises(ValueError, match="object id 70000 does not fit"):
+        write_frame_folder(tmp_path / "new", many)
+    assert not (tmp_path / "new").exists()
 
 
 def test_no_such_path_is_named(folder: Path) -> None:
@@ -135,3 +209,21 @@ def test_the_real_frame_reads() -> None:
     assert frame.rgb.shape == (480, 640, 3)
     assert set(np.unique(frame.label)) == {0, 1, 3, 9, 11}
     assert 0.6 < np.nanmedian(frame.depth[frame.label == 1]) < 1.0
+
+
+def test_what_no_source_is_gets_the_list_of_sources(folder: Path) -> None:
+    fails(Path("realsense:0"), "realsense:0 does not exist", "oak, oak:ID, webcam:N, a video file", ".mcap")
+
+
+def test_a_given_calibration_takes_the_place_of_the_recorded_one(folder: Path) -> None:
+    given = Camera(64, 48, np.array(K), np.ones(5))
+    assert next(iter(open_source(folder, given))).camera is given
+    for path in (folder, None):
+        with pytest.raises(ValueError, match="the camera is calibrated at 32x48 px but colour is"):
+            next(iter(open_source(path, Camera(32, 48, np.array(K), np.zeros(5)))))
+
+
+def test_what_is_recorded_is_not_live(folder: Path) -> None:
+    for source in (open_source(folder), open_source(None)):
+        assert not source.live
+        source.close()  # and may be closed nevertheless
