@@ -7,106 +7,85 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from contextlib import suppress
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Literal, get_type_hints
+from typing import Annotated, Any, NoReturn, TypeVar, get_type_hints
 
 import tyro
 from rich.console import Console
-from tyro.conf import Positional, arg
+from tyro.conf import arg
+
+from node.options import Calibrate, Capture, Live, Query, Record, Replay, View
+
+Options = TypeVar("Options")
 
 DESCRIPTION = """Farside: from one partial RGB-D view of an object, several whole, weighted shapes, and the probability
 that any space the camera cannot see is occupied. Lengths are in metres. With --debug an error shows its traceback."""
 
-
-@dataclass(frozen=True)
-class Replay:
-    """Infer whole-shape hypotheses for the objects in one recorded view; write a file and a picture for each."""
-
-    source: Annotated[
-        Positional[Path | None],
-        arg(metavar="[SOURCE]", help_behavior_hint="(default: the recording that ships with the project)"),
-    ] = None
-    """Frame folder (color.png, depth.png, meta.json) or recording (.mcap, .db3, .bag, ROS 2 bag folder)."""
-    object: Annotated[int | None, arg(metavar="ID", help_behavior_hint="(default: all)")] = None
-    """The one object to infer: its id in the label map or, without one, 1, 2, ... from the largest."""
-    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: out/<name of the source>)")] = None
-    """Folder for object_<id>.npz and object_<id>.png."""
-    budget: Annotated[
-        float | None, arg(metavar="SECONDS", help_behavior_hint="(default: 50; with --stages: no limit)")
-    ] = None
-    """Time for the whole job, shared by its objects."""
-    stages: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: until it has converged)")] = None
-    """Stop the sampler after N stages. Without a budget, the same input, seed and N give the same file."""
-    seed: Annotated[int, arg(metavar="N")] = 0
-    """Seed of everything random."""
-    method: Annotated[
-        Literal["tempered_smc", "annealed_hmc"] | None,
-        arg(metavar="{tempered_smc,annealed_hmc}", help_behavior_hint="(default: tempered_smc)"),
-    ] = None
-    """Sampler: weighted tempered populations, or the annealed chains of the ProbNeRF paper."""
-    frame: Annotated[int, arg(metavar="K")] = 0
-    """Which frame of a recording, from 0; -1 is the last."""
-    prior: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the shipped tabletop prior)")] = (
-        None
-    )
-    """Weights of another prior (.safetensors, as `farside train` writes them)."""
-    config: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
-    """YAML file with these options and all others by name, such as launch/replay.yaml; options given here win."""
-
-
-@dataclass(frozen=True)
-class Query:
-    """Ask how likely a box or some points are free, jointly over all hypotheses (and objects, if FILE is a folder)."""
-
-    file: Annotated[Positional[Path], arg(metavar="FILE")]
-    """Hypotheses file (object_<id>.npz), or the folder that `farside replay` wrote."""
-    box: Annotated[
-        tuple[float, float, float, float, float, float] | None,
-        arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint="(this or --points)"),
-    ] = None
-    """Two opposite corners of an axis-aligned box, metres."""
-    points: Annotated[Path | None, arg(metavar="FILE.xyz", help_behavior_hint="(this or --box)")] = None
-    """Text file of points, one a line: x y z in metres."""
-    frame: Literal["object", "camera", "world"] = "object"
-    """Frame of the question. object: z up, x to the camera, the plane under the origin; camera: x right, y down."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print JSON instead of a table."""
-
-
-@dataclass(frozen=True)
-class View:
-    """Describe a hypotheses file, or a folder of them, and draw its picture anew."""
-
-    file: Annotated[Positional[Path], arg(metavar="FILE")]
-    """Hypotheses file (object_<id>.npz), or the folder that `farside replay` wrote."""
-    out: Annotated[Path | None, arg(metavar="FILE.png", help_behavior_hint="(default: <FILE>_view.png)")] = None
-    """Where the picture goes."""
-
-
 BENCH = "Run a measurement: print its table, draw its picture, and write its figures as JSON."
-TRAIN = "Train a prior on procedural tabletop objects; resumes by itself after it was stopped."
+TRAIN = "Train a prior on procedural tabletop objects, or on pictures of your own; resumes by itself after a stop."
 SUMMARIES = {
     "replay": str(Replay.__doc__),
+    "live": str(Live.__doc__),
+    "record": str(Record.__doc__),
     "query": str(Query.__doc__),
     "view": str(View.__doc__),
+    "calibrate": str(Calibrate.__doc__).split("\n")[0],
+    "capture": str(Capture.__doc__),
     "train": TRAIN,
     "bench": BENCH,
 }
 
 
-def _replay(args: Sequence[str]) -> int:
-    options = tyro.cli(Replay, args=args, prog="farside replay")
-    from node.config import load_config
-    from node.pipeline import ReplayConfig, replay
+def _configured(kind: type[Options], prog: str, args: Sequence[str], load: Callable[[], type]) -> Any:
+    """The configuration that `load` names, filled from a command's options and their --config file."""
+    options = tyro.cli(kind, args=args, prog=prog)  # first of all: a mistyped option answers at once
+    into = load()
+    names = [f.name for f in fields(kind) if f.name != "config"]  # type: ignore[arg-type]
+    config = into()
+    if (path := options.config) is not None:  # type: ignore[attr-defined]
+        from node.config import load_config
 
-    config = ReplayConfig()
-    if options.config is not None:  # the file's values become the defaults, and the options are read again
-        config = load_config(options.config, ReplayConfig)
-        given = {f.name: getattr(config, f.name) for f in fields(Replay) if f.name != "config"}
-        options = tyro.cli(Replay, args=args, prog="farside replay", default=Replay(**given))
-    values = {f.name: getattr(options, f.name) for f in fields(Replay) if f.name != "config"}
-    return 0 if replay(replace(config, **values), Console(), Console(stderr=True)) else 130
+        config = load_config(path, into)  # its values become the defaults, and the options are read again
+        options = tyro.cli(kind, args=args, prog=prog, default=kind(**{n: getattr(config, n) for n in names}))
+    return replace(config, **{name: getattr(options, name) for name in names})
+
+
+def _replay(args: Sequence[str]) -> int:
+    def load() -> type:
+        from node.pipeline import ReplayConfig
+
+        return ReplayConfig
+
+    config = _configured(Replay, "farside replay", args, load)
+    from node.pipeline import replay
+
+    run = replay
+    if config.schedule:
+        from node.follow import follow as run
+    return 0 if run(config, Console(), Console(stderr=True)) else 130
+
+
+def _live(args: Sequence[str]) -> int:
+    def load() -> type:
+        from node.live import LiveConfig
+
+        return LiveConfig
+
+    config = _configured(Live, "farside live", args, load)
+    from node.live import live
+
+    live(config, Console(), Console(stderr=True))
+    return 0
+
+
+def _record(args: Sequence[str]) -> int:
+    options = tyro.cli(Record, args=args, prog="farside record")
+    from node.recording import record
+
+    record(options, Console(), Console(stderr=True))
+    return 0
 
 
 def _query(args: Sequence[str]) -> int:
@@ -124,10 +103,45 @@ def _query(args: Sequence[str]) -> int:
 
 def _view(args: Sequence[str]) -> int:
     options = tyro.cli(View, args=args, prog="farside view")
-    from node.pipeline import view
+    if (options.file is None) == (options.live is None):
+        raise ValueError("give either FILE, hypotheses to look at, or --live ENDPOINT of a node that runs")
+    if options.live is not None:
+        if options.out is not None:
+            raise ValueError("--out draws a file's picture; leave it away with --live")
+        from node.watch import watch
 
-    view(options.file, options.out, Console())
+        watch(options.live, options.node, options.port, Console(), Console(stderr=True))
+        return 0
+    from node.view import draw, open_page
+
+    assert options.file is not None
+    if options.out is None:
+        open_page(options.file, options.port, Console(), Console(stderr=True))
+    else:
+        draw(options.file, options.out, Console(), Console(stderr=True))
     return 0
+
+
+def _calibrate(args: Sequence[str]) -> int:
+    options = tyro.cli(Calibrate, args=args, prog="farside calibrate")
+    if sum(given is not None for given in (options.source, options.from_, options.print_target)) != 1:
+        raise ValueError("give one of SOURCE (pictures of a board), --from SOURCE and --print-target FILE.pdf")
+    from node.calibration import calibrate_camera, copy_camera, print_target
+
+    if options.print_target is not None:
+        print_target(options.print_target, options.board, options.paper, Console())
+    elif options.from_ is not None:
+        copy_camera(options, options.from_, Console())
+    else:
+        calibrate_camera(options, Console(), Console(stderr=True))
+    return 0
+
+
+def _capture(args: Sequence[str]) -> int:
+    options = tyro.cli(Capture, args=args, prog="farside capture")
+    from node.capture import capture
+
+    return 0 if capture(options, Console(), Console(stderr=True)) else 130
 
 
 def _train(args: Sequence[str]) -> int:
@@ -190,8 +204,12 @@ def _documented(name: str, text: str) -> Callable[[], None]:
 
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "replay": _replay,
+    "live": _live,
+    "record": _record,
     "query": _query,
     "view": _view,
+    "calibrate": _calibrate,
+    "capture": _capture,
     "train": _train,
     "bench": _bench,
 }
@@ -200,9 +218,12 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code: 0, 1 for an error of the input, 130 after Ctrl-C.
 
-    Mistyped options end the process with code 2, help with 0 (`SystemExit`).
+    Mistyped options end the process with code 2, help with 0 (`SystemExit`). Without `argv` it is the program, and ends
+    the process with the code.
     """
-    given = list(sys.argv[1:] if argv is None else argv)
+    if argv is None:
+        _end(main(sys.argv[1:]))
+    given = list(argv)
     args = [a for a in given if a != "--debug"]
     # Compiled programs outlive the process. JAX reads these when it is first imported.
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "farside"
@@ -230,5 +251,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
+def _end(code: int) -> NoReturn:
+    """End the process at once: after a Ctrl-C while it compiled, jaxlib crashes in the interpreter's own way to end."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError):  # nobody reads it any more
+            stream.flush()
+    os._exit(code)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

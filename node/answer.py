@@ -23,14 +23,15 @@ def answer(path: Path, region: Box | Points, frame: FrameName, as_json: bool, ou
         out.print(json.dumps(result.as_dict(), indent=1), highlight=False, soft_wrap=True, markup=False)
         return
     table = Table.grid(padding=(0, 2))
-    for name, value in _rows(result):
+    for name, value in rows(result):
         table.add_row(name, value)
     out.print(table, highlight=False)
     for i, p in enumerate(result.p_occupied or [], start=1):
         out.print(f"  point {i}: occupied with probability {p:.3f}", highlight=False)
 
 
-def _rows(r: QueryResult) -> list[tuple[str, str]]:
+def rows(r: QueryResult) -> list[tuple[str, str]]:
+    """What is said of a region: names and values with units, in the order of reading."""
     v = {name: CM3 * value for name, value in r.volume_m3.items()}
     return [
         ("all of it is free", f"{r.p_free:.3f} ± {r.p_free_se:.3f}"),

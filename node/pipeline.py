@@ -11,13 +11,17 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from calibration.camera import Camera
+from calibration.camera_info import read_camera
 from node.plot import draw_object
 from node.summary import figures, warnings
 from perception.controller import ControllerConfig, Estimate, estimate
 from perception.hypotheses import Hypotheses
+from perception.playback import open_playback
 from perception.segment import Segment, SegmentConfig, segment
-from perception.source import SHIPPED_LOG, Frame, open_source
-from perception.store import hypotheses_path, load, load_scene, save
+from perception.source import SHIPPED_LOG, Frame, write_frame_folder
+from perception.store import frame_path, hypotheses_path, load, save
+from perception.track import TrackConfig
 from probnerf.hmc import StageInfo
 from probnerf.infer import Method
 from probnerf.store import Prior, load_prior
@@ -37,16 +41,32 @@ class ReplayConfig:
     stages: int | None = None  # of the sampler, per object
     seed: int = 0
     method: Method | None = None  # None: that of `controller.infer`
-    frame: int = 0  # of a recording; -1 is the last
+    frame: int = 0  # of a recording (of its range); -1 is the last
+    start_s: float = 0.0  # of a recording: --from and --to, s after its first frame
+    end_s: float | None = None
+    schedule: bool = False  # repeat the inferences that the recording tells of
+    camera: Path | None = None  # calibration in place of the source's intrinsics
     prior: Path | None = None  # None: the one that ships with the project
+    colour_only: bool = False  # leave depth out
+    box: tuple[int, int, int, int] | None = None  # px, of a frame without depth; wins over segment.mask
     segment: SegmentConfig = field(default_factory=SegmentConfig)
     controller: ControllerConfig = field(default_factory=ControllerConfig)
+    track: TrackConfig = field(default_factory=TrackConfig)  # of a schedule
 
     def __post_init__(self) -> None:
         if self.budget is not None and not self.budget > 0:
             raise ValueError(f"the budget is {self.budget:g} s; give more than 0")
         if self.stages is not None and self.stages < 1:
             raise ValueError(f"stages is {self.stages}; give 1 or more")
+        if not 0 <= self.seed < 1 << 32:
+            raise ValueError(f"the seed is {self.seed}; give 0 to {(1 << 32) - 1}")
+
+    @property
+    def inference(self) -> ControllerConfig:
+        """The controller's configuration with the method that was asked for."""
+        if self.method is None:
+            return self.controller
+        return replace(self.controller, infer=replace(self.controller.infer, method=self.method))
 
     @property
     def folder(self) -> Path:
@@ -65,26 +85,35 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
     if config.folder.exists() and not config.folder.is_dir():
         raise ValueError(f"{config.folder} is a file; give a folder for the results with --out")
     prior = load_prior(config.prior)
-    frame = read_frame(config.source, config.frame, err)
-    segments = segment(frame, config.object, config.segment)
+    camera = None if config.camera is None else read_camera(config.camera)
+    frame = read_frame(config.source, config.frame, err, config.start_s, config.end_s, camera)
+    if config.colour_only:
+        frame = replace(frame, depth=None)
+    segments = segment(frame, config.object, _segmentation(frame, config))
     limit = config.budget or (None if config.stages else BUDGET_S)
-    done: list[Hypotheses] = []
+    kept, done = frame_path(config.folder), list[Hypotheses]()
+    is_source = config.source is not None and config.source.resolve() == kept.resolve()
     complaint = ValueError("no object")
     for i, found in enumerate(segments):
         share = None
         if limit is not None:
             share = (begun + limit - time.monotonic()) / (len(segments) - i) - PICTURE_S
         try:
-            result = _infer(frame, found, prior, config, share, err)
+            budget = None if share is None else max(share, 1.0)
+            result = infer(frame, found, prior, config.inference, err, config.seed, config.stages, budget)
         except ValueError as error:
             if len(segments) == 1:
                 raise
             err.print(f"object {found.id} is left out: {error}", highlight=False, soft_wrap=True)
             complaint = error
             continue
-        path = _publish(config.folder, frame, found, result, out)
+        if not done and not is_source:
+            (kept / "meta.json").unlink(missing_ok=True)  # an earlier run's frame is not read beside this one's objects
+        path = publish(config.folder, frame, found, result.hypotheses, result.seconds, out)
         if not done:
             _clear_others(config.folder, path, result.hypotheses if config.object is not None else None, out)
+            if not is_source:
+                write_frame_folder(kept, frame)
         done.append(result.hypotheses)
         if result.hypotheses.result == "interrupted":
             return False
@@ -93,9 +122,28 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
     return True
 
 
-def read_frame(source: Path | None, index: int, err: Console) -> Frame:
-    """Frame `index` of a source (-1: the last). Its notes go to `err`. Raises ValueError where there is none."""
-    opened = open_source(source)
+def _segmentation(frame: Frame, config: ReplayConfig) -> SegmentConfig:
+    """How objects are found, with the box that was drawn. Raises `ValueError` where depth makes it idle."""
+    if config.box is None:
+        return config.segment
+    if frame.depth is not None:
+        raise ValueError("the frame has depth, which finds its objects: leave --box away, or add --colour-only")
+    return replace(config.segment, mask=replace(config.segment.mask, box_px=config.box))
+
+
+def read_frame(
+    source: Path | None,
+    index: int,
+    err: Console,
+    start_s: float = 0.0,
+    end_s: float | None = None,
+    camera: Camera | None = None,
+) -> Frame:
+    """Frame `index` (-1: the last) of a source, or of a recording's range, with `camera` in place of its own.
+
+    Its notes go to `err`. Raises ValueError where there is none.
+    """
+    opened = open_playback(source, start_s=start_s, end_s=end_s, camera=camera)
     frame, count = None, 0
     for count, frame in enumerate(opened, start=1):  # noqa: B007
         if count == index + 1:
@@ -106,32 +154,29 @@ def read_frame(source: Path | None, index: int, err: Console) -> Frame:
         raise ValueError(f"{source or SHIPPED_LOG} has no frame; record it again")
     if index not in (-1, count - 1):
         raise ValueError(
-            f"{source or SHIPPED_LOG} has {count} frames, no number {index}; give --frame 0 to {count - 1}"
+            f"{source or SHIPPED_LOG} has {count} frames{' in this range' if start_s or end_s is not None else ''},"
+            f" no number {index}; give --frame 0 to {count - 1}"
         )
     return frame
 
 
-def _infer(
+def infer(
     frame: Frame,
     found: Segment,
     prior: Prior,
-    config: ReplayConfig,
-    share: float | None,
+    controller: ControllerConfig,
     err: Console,
+    seed: int,
+    stages: int | None,
+    budget: float | None = None,
 ) -> Estimate:
     """One object's estimate, its progress shown."""
-    controller = config.controller
-    if config.method is not None:
-        controller = replace(controller, infer=replace(controller.infer, method=config.method))
-    budget = None if share is None else max(share, 1.0)
-    with _progress(f"object {found.id}", config.stages, budget, err) as on_stage:
-        return estimate(
-            frame, found, prior, controller, seed=config.seed, budget_s=budget, stages=config.stages, on_stage=on_stage
-        )
+    with progress_of(f"object {found.id}", stages, budget, err) as on_stage:
+        return estimate(frame, found, prior, controller, seed=seed, budget_s=budget, stages=stages, on_stage=on_stage)
 
 
 @contextmanager
-def _progress(
+def progress_of(
     name: str, stages: int | None, budget: float | None, err: Console
 ) -> Iterator[Callable[[StageInfo], None]]:
     """A line that tells the stage, how far the tempering is, and how the sampler moves."""
@@ -144,7 +189,7 @@ def _progress(
             beta, acceptance = min(info.beta), sum(info.acceptance) / len(info.acceptance)
             parts = [0.0]
             if stages is not None:
-                parts.append(info.stage / stages)
+                parts.append(info.stage / max(stages, 1))
             if budget is not None:
                 parts.append((time.monotonic() - begun) / budget)
             text = f"{name}: stage {info.stage}, temperature {1 / max(beta, 1e-9):.3g}, acceptance {acceptance:.2f}"
@@ -153,14 +198,13 @@ def _progress(
         yield on_stage
 
 
-def _publish(folder: Path, frame: Frame, found: Segment, result: Estimate, out: Console) -> Path:
-    """Save, picture and print one object."""
-    h = result.hypotheses
+def publish(folder: Path, frame: Frame, found: Segment, h: Hypotheses, seconds: float, out: Console) -> Path:
+    """Save, picture and print one object; the file's path."""
     path = hypotheses_path(folder, h.object_id)
     save(path, h)
     picture = path.with_suffix(".png")
     draw_object(picture, h, frame, found)
-    report(h, out, time=f"{result.seconds:.1f} s")
+    report(h, out, time=f"{seconds:.1f} s")
     for written in (path, picture):
         out.print(f"  {written}", highlight=False, soft_wrap=True)
     return path
@@ -198,16 +242,3 @@ def report(h: Hypotheses, out: Console, **first: str) -> None:
     out.print(table, highlight=False)
     for line in warnings(h):
         out.print(f"  {line}", style="yellow", highlight=False, soft_wrap=True)
-
-
-def view(path: Path, picture: Path | None, out: Console) -> None:
-    """Describe a hypotheses file, or those of a folder, and draw each anew beside it (or to `picture`)."""
-    scene = load_scene(path)
-    if picture is not None and len(scene) > 1:
-        raise ValueError(f"{path} holds {len(scene)} objects; give one file, or leave --out away")
-    for h in scene:
-        own = hypotheses_path(path, h.object_id) if path.is_dir() else path
-        target = picture or own.with_name(f"{own.stem}_view.png")
-        draw_object(target, h)
-        report(h, out)
-        out.print(f"  {target}", highlight=False, soft_wrap=True)

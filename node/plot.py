@@ -17,10 +17,9 @@ from node.summary import figures, warnings
 from perception.hypotheses import Hypotheses
 from perception.segment import Segment
 from perception.source import Frame
-from probnerf.types import BASE_Z, FREE, OBJECT, UNKNOWN
+from probnerf.types import BASE_Z, UNKNOWN
 
 SHOWN = 4  # hypotheses in a picture
-_STATUS = {OBJECT: ("object", "#2ca02c"), FREE: ("free", "#4f8fd0"), UNKNOWN: ("unknown", "#303030")}
 _PIXELS = 180  # of a small picture's side
 _LOG2 = float(np.log(2.0))
 _CURVES = {"loss": "loss (nats per object)", "fit": "fit (nats per object)", "kl": "KL (nats)"}
@@ -53,7 +52,7 @@ def draw_object(path: Path, h: Hypotheses, frame: Frame | None = None, segment: 
     _write_summary(axes[2, 4], h)
     name = f"object {h.object_id}" + (f" ({h.label})" if h.label else "")
     figure.suptitle(f"{name}: what one view says about the whole shape", fontsize=14, x=0.012, ha="left")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def draw_training(path: Path, history: list[dict[str, float]]) -> None:
@@ -78,7 +77,7 @@ def draw_training(path: Path, history: list[dict[str, float]]) -> None:
         )
         ax.set_xlabel("step")
         ax.grid(alpha=0.25)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def representatives(
@@ -118,11 +117,11 @@ def _draw_view(above: Axes, below: Axes, h: Hypotheses, frame: Frame | None, seg
     above.set_title("the view", fontsize=11)
     grey = crop.mean(axis=2, keepdims=True)
     paint = np.zeros_like(crop)
-    for value, (_, colour) in _STATUS.items():
+    for value, (_, colour) in shade.STATUS.items():
         paint[status == value] = to_rgb(colour)
     below.imshow(0.5 * grey + 0.5 * paint)
     below.set_title("what its pixels say of this object", fontsize=11)
-    handles = [Patch(color=colour, label=label) for label, colour in _STATUS.values()]
+    handles = [Patch(color=colour, label=label) for label, colour in shade.STATUS.values()]
     below.legend(handles=handles, loc="lower left", fontsize=8, ncols=3, framealpha=0.85, handlelength=1.0)
 
 
@@ -190,9 +189,12 @@ def _write_summary(ax: Axes, h: Hypotheses) -> None:
         ax.text(0.36, 0.95 - 0.08 * i, value, fontsize=9, transform=ax.transAxes)
     doubts = "\n".join(textwrap.fill(line, 44) for line in warnings(h))
     ax.text(0.03, 0.36, doubts, va="top", fontsize=9, color="#b03020", transform=ax.transAxes)
+    unseen = (
+        "surface not measured, or out of its sight" if h.object_frame.sight_sigma > 0 else "surface out of its sight"
+    )
     handles = [
         Patch(color=tuple(shade.SEEN), label="surface that the camera saw"),
-        Patch(color=tuple(shade.UNSEEN), label="surface out of its sight"),
+        Patch(color=tuple(shade.UNSEEN), label=unseen),
     ]
     ax.legend(handles=handles, loc="lower left", fontsize=9.5, frameon=False)
 
@@ -204,7 +206,7 @@ def _smoothed(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     return np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
     """Write the PNG whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")

@@ -12,10 +12,11 @@ from calibration.camera import Camera
 from perception.hypotheses import Hypotheses
 from perception.observe import ObjectFrame
 from probnerf.families.render import look_at, pinhole_rays
-from probnerf.types import BASE_Z
+from probnerf.types import BASE_Z, FREE, OBJECT, UNKNOWN
 
 RADIUS = 1.15  # a picture shows this much around the cube's centre
 SEEN, UNSEEN = np.array([0.62, 0.70, 0.78]), np.array([0.95, 0.60, 0.28])  # paint of surface the camera saw, or not
+STATUS = {OBJECT: ("object", "#2ca02c"), FREE: ("free", "#4f8fd0"), UNKNOWN: ("unknown", "#303030")}  # of a pixel
 _GROUND = np.array([0.93, 0.93, 0.92])
 _HIGHEST = np.deg2rad(35.0)  # elevation from which the far side is shown
 _STEP = 0.75  # voxels

@@ -43,6 +43,8 @@ def warnings(h: Hypotheses) -> list[str]:
     out = []
     if h.out_of_model:
         out.append("out of model: no shape of the prior explains this view; its answers are cautious")
+    if (share := h.object_frame.sight_sigma) > 0.0:
+        out.append(f"no depth: distance and size are known to {100 * share:.1f}% by the camera's height and tilt alone")
     if not h.inside_view:
         out.append("the picture's border cuts the object off")
     if (r_hat := h.diagnostics.get("r_hat", np.nan)) > R_HAT:

@@ -43,7 +43,7 @@ class Hypotheses:
     prior_hash: str
     seed: int
     diagnostics: dict[str, float]
-    result: str  # why sampling stopped: "converged", "budget", "stages", "interrupted"
+    result: str  # the sampler's (`Posterior.result`); "underway": better ones follow
 
     def __post_init__(self) -> None:
         shape = self.opacity.shape
@@ -172,26 +172,27 @@ def by_weight(hypotheses: Hypotheses) -> Int[np.ndarray, "D"]:
 
 
 def meshes(hypotheses: Hypotheses, k: int) -> list[tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]]:
-    """Closed outer surfaces of the k heaviest distinct hypotheses: (vertices in metres in the object frame, triangles).
+    """`mesh` of the k heaviest distinct hypotheses."""
+    return [mesh(hypotheses, index) for index in by_weight(hypotheses)[:k]]
+
+
+def mesh(hypotheses: Hypotheses, index: int) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """Closed outer surface of one hypothesis: (vertices in metres in the object frame, triangles).
 
     Triangles turn counter-clockwise seen from outside; an empty shape has no vertices.
     """
-    out = []
-    for index in by_weight(hypotheses)[:k]:
-        occupied = hypotheses.solid[index]
-        if not occupied.any():
-            out.append((np.zeros((0, 3)), np.zeros((0, 3), np.int32)))
-            continue
-        # The walls' own opacity places the surface between voxels; all that is solid lies above the level, so that no
-        # inner wall is drawn.
-        opacity = hypotheses.opacity[index]
-        level = np.where(occupied, np.maximum(opacity, 128), np.minimum(opacity, 127)).astype(np.float32)
-        level[..., voxel_centres(hypotheses.grid)[0, 0, :, 2] < hypotheses.base[index]] = 0.0
-        # With axes in the order x, y, z its "ascent" is what turns triangles counter-clockwise about a full inside.
-        vertices, faces, _, _ = marching_cubes(np.pad(level, 1), 127.5, gradient_direction="ascent")
-        cube = -1.0 + (vertices.astype(np.float64) - 0.5) * 2.0 / hypotheses.grid  # one voxel of padding
-        out.append((cube * hypotheses.object_frame.half_extent, faces.astype(np.int32)))
-    return out
+    occupied = hypotheses.solid[index]
+    if not occupied.any():
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int32)
+    # The walls' own opacity places the surface between voxels; all that is solid lies above the level, so that no
+    # inner wall is drawn.
+    opacity = hypotheses.opacity[index]
+    level = np.where(occupied, np.maximum(opacity, 128), np.minimum(opacity, 127)).astype(np.float32)
+    level[..., voxel_centres(hypotheses.grid)[0, 0, :, 2] < hypotheses.base[index]] = 0.0
+    # With axes in the order x, y, z its "ascent" is what turns triangles counter-clockwise about a full inside.
+    vertices, faces, _, _ = marching_cubes(np.pad(level, 1), 127.5, gradient_direction="ascent")
+    cube = -1.0 + (vertices.astype(np.float64) - 0.5) * 2.0 / hypotheses.grid  # one voxel of padding
+    return cube * hypotheses.object_frame.half_extent, faces.astype(np.int32)
 
 
 def surface_points(hypotheses: Hypotheses, index: int) -> Float[np.ndarray, "n 3"]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from perception.hypotheses import FrameName, Hypotheses, binary_entropy
 from probnerf.occupancy import voxel_centres
@@ -19,7 +19,9 @@ from probnerf.types import BASE_Z
 
 # Weight of "all that was not seen is occupied" beside the hypotheses of an object that its prior cannot explain.
 CAUTION = 0.5
+REACH = 1e6  # m from the frame's origin that a region may lie: beyond, sizes and volumes overflow
 MAX_SAMPLES = 200_000  # lattice of a box that the unseen and outside fractions are counted on
+SWEPT_SAMPLES = 20_000  # the same of swept boxes, each of which is compared with all before it
 SLAB = 1_000_000  # samples of a box that are in memory at a time
 JOINT_DRAWS = 4096  # of the scene's volume, where there are several objects
 
@@ -32,8 +34,11 @@ class Box:
     high: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        if not np.all(np.isfinite([self.low, self.high])):
-            raise ValueError(f"the box {[*self.low, *self.high]} has a number that is not finite; give six, in metres")
+        if not np.all(np.abs([self.low, self.high]) <= REACH):  # a NaN is not
+            raise ValueError(
+                f"the box {[*self.low, *self.high]} has a number that is not finite, or beyond {REACH:g}; "
+                "give six, in metres"
+            )
         for axis, low, high in zip("xyz", self.low, self.high, strict=True):
             if not low < high:
                 raise ValueError(
@@ -51,9 +56,40 @@ class Points:
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or not len(self.points):
             raise ValueError(f"points have shape {list(self.points.shape)}; give [N, 3] with N >= 1, in metres")
-        if not np.all(np.isfinite(self.points)):
-            row = int(np.flatnonzero(~np.isfinite(self.points).all(axis=1))[0])
-            raise ValueError(f"point {row + 1} is {self.points[row].tolist()}; give finite numbers, in metres")
+        if not (near := np.all(np.abs(self.points) <= REACH, axis=1)).all():
+            row = int(np.flatnonzero(~near)[0])
+            raise ValueError(f"point {row + 1} is {self.points[row].tolist()}; give numbers up to {REACH:g}, in metres")
+
+
+@dataclass(frozen=True, eq=False)
+class Swept:
+    """The union of N >= 1 boxes that may be turned, such as what a gripper sweeps.
+
+    A box thinner than a voxel of the object that it meets counts as one voxel thick.
+    """
+
+    T_frame_box: Float[np.ndarray, "N 4 4"]  # p_frame = T_frame_box @ p_box; the box's middle is its origin, metres
+    size: Float[np.ndarray, "N 3"]  # lengths of its edges, metres
+
+    def __post_init__(self) -> None:
+        T, size = self.T_frame_box, self.size
+        if T.ndim != 3 or T.shape[1:] != (4, 4) or not len(T) or size.shape != (len(T), 3):
+            raise ValueError(
+                f"boxes have poses {list(T.shape)} and sizes {list(size.shape)}; give [N, 4, 4] and [N, 3]"
+            )
+        if not ((np.abs(T) <= REACH).all() and ((size > 0) & (size <= REACH)).all()):
+            raise ValueError(f"a box's pose is not finite, an edge is not longer than 0 m, or beyond {REACH:g} m")
+
+    def holds(self, box: int, *axes: Float[np.ndarray, "..."], thicker: float = 0.0) -> Bool[np.ndarray, "..."]:
+        """Whether points, given by coordinates that broadcast, lie in a box whose edges are at least `thicker` long."""
+        T, half = np.linalg.inv(self.T_frame_box[box])[:3], 0.5 * np.maximum(self.size[box], thicker)
+        inside = np.ones((), bool)
+        for (a, b, c, d), h in zip(T, half, strict=True):
+            inside = inside & (np.abs(a * axes[0] + b * axes[1] + (c * axes[2] + d)) <= h)
+        return inside
+
+
+Region = Box | Points | Swept
 
 
 @dataclass(frozen=True)
@@ -77,9 +113,7 @@ class QueryResult:
         return {name: value for name, value in vars(self).items() if value is not None}
 
 
-def query(
-    scene: Sequence[Hypotheses], region: Box | Points, frame: FrameName, now_ns: int | None = None
-) -> QueryResult:
+def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns: int | None = None) -> QueryResult:
     """Answer a question about `region`, given in metres in `frame`, jointly over all objects of the scene.
 
     Raises ValueError for an empty scene, objects of different frames, a frame that is unknown, or not recorded
@@ -103,7 +137,7 @@ def query(
         p_free.append(float(free))
         p_free_se.append(float(se))
         volumes.append((filled, weights))
-        entropies.append(binary_entropy(_marginal(h)[index]))
+        entropies.append(binary_entropy(marginal(h)[index]))
     # Errors of a product of independent factors: sum over objects of (se_o times the other factors)^2.
     others = [np.prod(p_free[:o] + p_free[o + 1 :]) for o in range(len(p_free))]
     unseen, outside = _fractions(scene, region, frame)
@@ -171,19 +205,20 @@ def _hidden(h: Hypotheses) -> np.ndarray:
     return (~h.seen & above).ravel()
 
 
-def _marginal(h: Hypotheses) -> Float[np.ndarray, "V"]:
+def marginal(h: Hypotheses) -> Float[np.ndarray, "V"]:
     """p_occupied of each of the G^3 voxels, cautious where the object is out of model."""
     p = h.p_occupied.ravel()
     return (1 - CAUTION) * p + CAUTION * _hidden(h) if h.out_of_model else p
 
 
 def _region_voxels(
-    h: Hypotheses, region: Box | Points, frame: FrameName
+    h: Hypotheses, region: Region, frame: FrameName
 ) -> tuple[Int[np.ndarray, "U"], Float[np.ndarray, "U"]]:
     """Flat indices of the object's voxels in the region, and the volume (m^3) of each that lies in it.
 
     A box, cut to the cube, is sampled on a lattice half a voxel wide or finer, at least one sample per axis, so that a
-    thin box still finds its voxels. Points stand for the voxels they fall in.
+    thin box still finds its voxels. Points stand for the voxels they fall in. Of swept boxes, each eighth of a voxel
+    counts whose centre lies in one.
     """
     hits = np.zeros(h.grid**3, int)
     if isinstance(region, Points):
@@ -191,6 +226,10 @@ def _region_voxels(
         index = np.flatnonzero(hits)
         return index, np.full(len(index), h.voxel_m**3)
     T = np.linalg.inv(h.T_object_from(frame))
+    if isinstance(region, Swept):
+        filled = _filled(h, region, np.linalg.inv(T) @ region.T_frame_box)
+        index = np.flatnonzero(filled)
+        return index, filled[index] * (0.5 * h.voxel_m) ** 3
     corners = h.object_frame.half_extent * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     corners = corners @ T[:3, :3].T + T[:3, 3]
     low, high = np.maximum(region.low, corners.min(axis=0)), np.minimum(region.high, corners.max(axis=0))
@@ -205,6 +244,23 @@ def _region_voxels(
     return index, hits[index] * np.prod((high - low) / counts)
 
 
+def _filled(h: Hypotheses, region: Swept, T_object_box: Float[np.ndarray, "N 4 4"]) -> Int[np.ndarray, "V"]:
+    """How many eighths of each voxel lie in the union of boxes."""
+    boxes, n = Swept(T_object_box, region.size), 2 * h.grid
+    width = 0.5 * h.voxel_m
+    centres = (np.arange(n) + 0.5) * width - h.object_frame.half_extent
+    inside = np.zeros((n, n, n), bool)
+    for k, (T, size) in enumerate(zip(T_object_box, region.size, strict=True)):
+        reach = np.abs(T[:3, :3]) @ (0.5 * np.maximum(size, h.voxel_m))
+        x, y, z = (
+            slice(*np.searchsorted(centres, [middle - r, middle + r]))
+            for middle, r in zip(T[:3, 3], reach, strict=True)
+        )
+        own = boxes.holds(k, centres[x, None, None], centres[y, None], centres[z], thicker=h.voxel_m)
+        inside[x, y, z] |= own
+    return inside.reshape(h.grid, 2, h.grid, 2, h.grid, 2).sum(axis=(1, 3, 5)).ravel()
+
+
 def _count(index: Int[np.ndarray, "..."], h: Hypotheses) -> Int[np.ndarray, "V"]:
     return np.bincount(index[index >= 0], minlength=h.grid**3)
 
@@ -217,10 +273,13 @@ def _lattice(
     return x[:, None, None], y[:, None], z
 
 
-def _fractions(scene: Sequence[Hypotheses], region: Box | Points, frame: FrameName) -> tuple[float, float]:
+def _fractions(scene: Sequence[Hypotheses], region: Region, frame: FrameName) -> tuple[float, float]:
     """Shares of the region that are (inside some cube but not seen, outside every cube)."""
+    share = np.ones(())
     if isinstance(region, Points):
         x, y, z = region.points.T
+    elif isinstance(region, Swept):
+        (x, y, z), share = _sampled(region, 0.5 * min(h.voxel_m for h in scene))
     else:
         low, high = np.array(region.low), np.array(region.high)
         counts = (high - low) / (0.5 * min(h.voxel_m for h in scene)) * (1 - 1e-9)
@@ -232,7 +291,25 @@ def _fractions(scene: Sequence[Hypotheses], region: Box | Points, frame: FrameNa
         index = h.voxels(frame, x, y, z)
         inside = inside | (index >= 0)
         seen = seen | ((index >= 0) & h.seen.ravel()[index])
-    return float(np.mean(inside & ~seen)), float(np.mean(~inside))
+    share = np.broadcast_to(share, np.shape(inside))
+    return float(np.average(inside & ~seen, weights=share)), float(np.average(~inside, weights=share))
+
+
+def _sampled(region: Swept, width: float) -> tuple[Float[np.ndarray, "3 n"], Float[np.ndarray, "n"]]:
+    """Points of the union of boxes, at most `SWEPT_SAMPLES` in all, and the volume that each stands for."""
+    points, shares = [], []
+    for k, (T, size) in enumerate(zip(region.T_frame_box, region.size, strict=True)):
+        counts = size / width
+        while np.prod(np.ceil(counts)) > max(1, SWEPT_SAMPLES // len(region.size)):
+            counts *= 0.9
+        counts = np.maximum(np.ceil(counts), 1).astype(int)
+        own = np.stack(np.broadcast_arrays(*_lattice(-0.5 * size, 0.5 * size, counts))).reshape(3, -1)
+        own = T[:3, :3] @ own + T[:3, 3:]
+        for earlier in range(k):  # what two boxes share counts once
+            own = own[:, ~region.holds(earlier, *own)]
+        points.append(own)
+        shares.append(np.full(own.shape[1], np.prod(size / counts)))
+    return np.concatenate(points, axis=1), np.concatenate(shares)
 
 
 def _p_occupied(scene: Sequence[Hypotheses], region: Points, frame: FrameName) -> list[float]:
@@ -240,7 +317,7 @@ def _p_occupied(scene: Sequence[Hypotheses], region: Points, frame: FrameName) -
     free = np.ones(len(region.points))
     for h in scene:
         index = h.voxels(frame, *region.points.T)
-        free *= np.where(index >= 0, 1.0 - _marginal(h)[index], 1.0)
+        free *= np.where(index >= 0, 1.0 - marginal(h)[index], 1.0)
     return (1.0 - free).tolist()
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from calibration.camera import Camera
-from perception.log import write_log
+from perception.record import write_log
 from perception.simulate import Placed, Scene, SensorConfig, place_camera, render, sense
 from perception.source import SHIPPED_LOG, Frame
 

@@ -26,8 +26,13 @@ def hypotheses_path(folder: str | Path, object_id: int) -> Path:
     return Path(folder) / f"object_{object_id}.npz"
 
 
+def frame_path(folder: str | Path) -> Path:
+    """Where the frame that a folder's hypotheses were inferred from is kept, as a frame folder."""
+    return Path(folder) / "frame"
+
+
 def save(path: str | Path, hypotheses: Hypotheses) -> None:
-    """Write the file whole or not at all (a temporary file beside it, then a rename)."""
+    """Write the file whole or not at all (a temporary file beside it, then a rename). Raises OSError that names it."""
     h, path = hypotheses, Path(path)
     header = {
         "format": f"{FORMAT}{VERSION}",
@@ -38,6 +43,8 @@ def save(path: str | Path, hypotheses: Hypotheses) -> None:
         "half_extent": float(h.object_frame.half_extent),
         "xy_sigma": float(h.object_frame.xy_sigma),
         "log_scale_sigma": float(h.object_frame.log_scale_sigma),
+        "along_sigma": float(h.object_frame.along_sigma),
+        "sight_sigma": float(h.object_frame.sight_sigma),
         "inside_view": bool(h.inside_view),
         "out_of_model": bool(h.out_of_model),
         "stage": int(h.stage),
@@ -69,6 +76,10 @@ def save(path: str | Path, hypotheses: Hypotheses) -> None:
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     np.lib.format.write_array(member, array, allow_pickle=False)
         os.replace(temporary, path)
+    except OSError as error:
+        raise OSError(
+            f"{path} cannot be written ({error.strerror or error}); make room or give another place"
+        ) from None
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -139,6 +150,8 @@ def _from_file(header: dict, arrays: dict[str, np.ndarray]) -> Hypotheses:
         plane=arrays["plane"],
         xy_sigma=header["xy_sigma"],
         log_scale_sigma=header["log_scale_sigma"],
+        along_sigma=header.get("along_sigma", 0.0),  # files before these had depth
+        sight_sigma=header.get("sight_sigma", 0.0),
     )
     return Hypotheses(
         stamp_ns=header["stamp_ns"],

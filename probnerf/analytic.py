@@ -22,17 +22,17 @@ from probnerf.types import FREE, OBJECT, UNKNOWN, Observation, Rays
 Args = tuple[CylinderModel, Likelihood, Observation, Float[Array, "n m"]]  # what `model.log_likelihood` takes
 
 
-def grid_of_rays(columns: int, rows: int, elevation: float = 20.0, distance: float = 4.0) -> Rays:
-    """Pixels of a camera at +x, `elevation` degrees above the table, that looks at the cylinder; left column first.
+def grid_of_rays(columns: int, rows: int, elevation: float = 20.0, distance: float = 4.0, azimuth: float = 0.0) -> Rays:
+    """Pixels of a camera `azimuth` degrees from +x and `elevation` above the table that looks at the cylinder.
 
-    They cover 2.3 by 1.7 cube units around the object. The image's left is -y.
+    Left column first; they cover 2.3 by 1.7 cube units around the object. At azimuth 0 the image's left is -y.
     """
-    e = np.deg2rad(elevation)
+    e, a = np.deg2rad(elevation), np.deg2rad(azimuth)
     target = np.array([0.0, 0.0, -0.2])
     forward, right, up = (
-        np.array([-np.cos(e), 0.0, -np.sin(e)]),
-        np.array([0.0, 1.0, 0.0]),
-        np.array([-np.sin(e), 0.0, np.cos(e)]),
+        np.array([-np.cos(e) * np.cos(a), -np.cos(e) * np.sin(a), -np.sin(e)]),
+        np.array([-np.sin(a), np.cos(a), 0.0]),
+        np.array([-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e)]),
     )
     u, v = np.meshgrid(
         (np.arange(columns) + 0.5) / columns * 2 - 1, (np.arange(rows) + 0.5) / rows * 2 - 1, indexing="ij"
@@ -106,12 +106,22 @@ def object_first(observation: Observation, colour_count: int) -> Observation:
 YAW_OF = {"seen": 60.0, "hidden": 180.0, "half": -70.0}  # degrees; "half": the left half, with the handle, is unknown
 
 
-def scene(condition: str, depth: bool, seed: int = 0, columns: int = 12, rows: int = 8, cubes: int = 16) -> Args:
+def scene(
+    condition: str,
+    depth: bool,
+    seed: int = 0,
+    columns: int = 12,
+    rows: int = 8,
+    cubes: int = 16,
+    azimuth: float = 0.0,
+) -> Args:
     """One view of a cylinder whose handle is "seen", "hidden" behind it, or in the picture's unknown half ("half").
+
+    So it is for a camera at azimuth 0 (degrees).
 
     Returns the arguments of `model.log_likelihood`; every scene of one size has the same shapes.
     """
-    rays = grid_of_rays(columns, rows)
+    rays = grid_of_rays(columns, rows, azimuth=azimuth)
     bare = foam.Lattice(cubes)
     likelihood = Likelihood(foam.Lattice(cubes, max_crossings=foam.count_crossings(rays, bare)))
     yaw = np.deg2rad(YAW_OF[condition])

@@ -215,6 +215,7 @@ class StageInfo:
     log_evidence: tuple[float, ...]  # of the tempered target at `beta` (NaN for samplers that have none)
     divergences: int  # so far
     seconds: float  # since the start
+    samples: Callable[[], Posterior]  # the draws at hand, of the target at `beta`; made when asked for
 
 
 @dataclass(frozen=True)
@@ -260,7 +261,7 @@ def annealed_hmc(
     dim: int,
     config: AnnealedHMCConfig | None = None,
     *,
-    on_stage: Callable[[StageInfo], None] | None = None,
+    on_stage: Callable[[StageInfo], bool | None] | None = None,
     deadline: float | None = None,
 ) -> Posterior:
     """The paper's sampler (section 3.3): independent chains cooled from s_start to s_end, s_t = s_0^(1-t/T) s_T^(t/T).
@@ -268,8 +269,8 @@ def annealed_hmc(
     Every likelihood term is multiplied by (s_end / s_t)^2 and the step size is proportional to s_t. Kept are the last
     `keep` states of each chain, equally weighted; all but the very last are drawn at s_t > s_end, so this is no sample
     of the posterior, and there is no evidence (NaN). The integrator is the split one with identity mass. `deadline` is
-    on time.monotonic()'s clock. result is "stages" when the schedule was completed, else "budget" or "interrupted" with
-    the states at hand. `point_gradients` counts gradient evaluations of whole positions.
+    on time.monotonic()'s clock. result is "stages" when the schedule was completed, else "budget", "stopped" (by
+    `on_stage`) or "interrupted", with the states at hand. `point_gradients` counts gradients of whole positions.
     """
     config = config or AnnealedHMCConfig()
     begun = time.monotonic()
@@ -277,8 +278,12 @@ def annealed_hmc(
     state = _annealed_start(start_key, args, log_likelihood=log_likelihood, chains=config.chains, dim=dim)
     kept = [(np.asarray(state.position), np.asarray(state.log_likelihood))]
     acceptances: list[float] = []
-    divergences, base, result = 0, config.step_per_scale, "stages"
+    divergences, base, beta, result = 0, config.step_per_scale, 0.0, "stages"
     base = min(base, MAX_ANNEALED_STEP / config.s_start)
+
+    def samples(result: str = "underway") -> Posterior:
+        return _annealed_posterior(config, kept, acceptances, divergences, beta, result)
+
     try:
         for t in range(1, config.iterations + 1):
             # An iteration costs about the mean of those before: none is begun that would overrun the deadline.
@@ -300,13 +305,19 @@ def annealed_hmc(
                 base = min(base, MAX_ANNEALED_STEP / config.s_start)
             if on_stage is not None:
                 none, seconds = (float("nan"),), time.monotonic() - begun
-                on_stage(StageInfo(t, (beta,), none, (acceptances[-1],), (step,), none, divergences, seconds))
+                told = StageInfo(t, (beta,), none, (acceptances[-1],), (step,), none, divergences, seconds, samples)
+                if on_stage(told):
+                    result = "stopped"
+                    break
     except KeyboardInterrupt:
         result = "interrupted"
+    return samples(result)
 
+
+def _annealed_posterior(config, kept, acceptances, divergences, beta, result) -> Posterior:
     positions = np.stack([q for q, _ in kept])  # [kept, chains, dim]
     values = np.stack([value for _, value in kept])
-    count = values.size
+    count, dim = values.size, positions.shape[-1]
     done = len(acceptances)
     nan = jnp.asarray(np.float32("nan"))
     return Posterior(
@@ -324,6 +335,8 @@ def annealed_hmc(
             ancestors=jnp.asarray(np.int32(config.chains)),
             stages=jnp.asarray(np.int32(done)),
             point_gradients=jnp.asarray(np.float32(config.chains * (1 + done * config.leapfrog_steps))),
+            beta=jnp.asarray(np.full(config.chains, beta, np.float32)),
+            log_evidences=jnp.asarray(np.full(config.chains, np.nan, np.float32)),
         ),
         result=result,
     )

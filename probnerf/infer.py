@@ -25,8 +25,8 @@ from probnerf.model import (
 )
 from probnerf.prior import ProbNeRF
 from probnerf.proposal import Picture, propose
-from probnerf.smc import TemperedSMCConfig, tempered_smc
-from probnerf.types import OBJECT, UNKNOWN, Observation, Pose, Posterior
+from probnerf.smc import TemperedSMCConfig, log_prior, tempered_smc
+from probnerf.types import BASE_Z, OBJECT, UNKNOWN, Observation, Pose, Posterior
 
 Method = Literal["tempered_smc", "annealed_hmc"]
 WALL_ERROR = 0.02  # cube units; how well the prior's shapes place a wall
@@ -66,6 +66,13 @@ class InferConfig:
     encoder_starts: bool = True  # propose starts by the encoder, in a defensive mixture with the prior
     sample_delta: bool = False  # also infer the weights' perturbation delta
 
+    def __post_init__(self) -> None:
+        if self.lattice < 1 or not min(self.extent, self.colour_sigma, self.wall_sigma, self.power) > 0:
+            raise ValueError(
+                f"lattice {self.lattice} must be 1 or more, and extent {self.extent:g}, colour_sigma"
+                f" {self.colour_sigma:g}, wall_sigma {self.wall_sigma:g} and power {self.power:g} more than 0"
+            )
+
 
 def likelihood_of(config: InferConfig, observation: Observation, sample_pose: bool = True) -> Likelihood:
     """The likelihood's settings for one view; its sizes are padded, so that few of them compile."""
@@ -90,6 +97,12 @@ def likelihood_of(config: InferConfig, observation: Observation, sample_pose: bo
     return replace(likelihood, lattice=replace(lattice, max_crossings=most), packed=packed)
 
 
+def without_sizes(likelihood: Likelihood) -> Likelihood:
+    """The settings less the padded sizes of one view, so that what is asked of shapes compiles once for all views."""
+    lattice = likelihood.lattice
+    return replace(likelihood, lattice=replace(lattice, max_crossings=3 * lattice.planes), packed=(0, 0))
+
+
 def infer(
     key: Array,
     model: Model,
@@ -97,14 +110,17 @@ def infer(
     config: InferConfig | None = None,
     *,
     picture: Picture | None = None,
+    before: Posterior | None = None,
     sample_pose: bool = True,
-    on_stage: Callable[[StageInfo], None] | None = None,
+    on_stage: Callable[[StageInfo], bool | None] | None = None,
     deadline: float | None = None,
     stages: int | None = None,
 ) -> tuple[Posterior, Likelihood]:
     """Sample p(z~, pose, delta | observation).
 
-    `picture` lets the encoder propose starts (ProbNeRF models only). `deadline` is on time.monotonic()'s clock;
+    `picture` lets the encoder propose starts (ProbNeRF models only). `before` is a posterior of the same latents (the
+    same cube and pose widths) given another observation, usually a part of this one: its samples are reweighted, then
+    moved (`start_from`). `deadline` is on time.monotonic()'s clock;
     `stages` caps the sampler's stages (iterations of annealed HMC, whose schedule is shortened to fit).
     """
     config = config or InferConfig()
@@ -117,7 +133,9 @@ def infer(
         )
         return annealed_hmc(key, log_likelihood, args, dim, hmc, on_stage=on_stage, deadline=deadline), likelihood
     initial = None
-    if picture is not None and config.encoder_starts and isinstance(model, ProbNeRF) and not config.sample_delta:
+    if before is not None:
+        initial = start_from(before)
+    elif picture is not None and config.encoder_starts and isinstance(model, ProbNeRF) and not config.sample_delta:
         key, start = jax.random.split(key)
         initial = propose(
             start,
@@ -132,6 +150,20 @@ def infer(
         key, log_likelihood, args, dim, config.smc, initial=initial, on_stage=on_stage, deadline=deadline, stages=stages
     )
     return posterior, likelihood
+
+
+def start_from(before: Posterior) -> tuple[Float[Array, "m n d"], Float[Array, "m n"]]:
+    """The samples of tempered SMC as starts for another target: positions per population, and log-densities there.
+
+    Population p's samples are draws of N(q; 0, I) L(q)^beta_p / Z_p. With its own estimate of Z_p, the evidence of the
+    new target starts where the old one's ended, and populations keep their shares.
+    """
+    beta, log_z = before.diagnostics.beta, before.diagnostics.log_evidences
+    m = len(beta)
+    order = np.argsort(np.asarray(before.population), kind="stable")
+    positions = before.positions[order].reshape(m, -1, before.positions.shape[-1])
+    log_likelihoods = before.log_likelihoods[order].reshape(m, -1)
+    return positions, log_prior(positions) + beta[:, None] * log_likelihoods - log_z[:, None]
 
 
 def thin(posterior: Posterior, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -188,6 +220,26 @@ def poses(model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], 
         return Pose(*[zeros] * 5)
     k = model.latent
     return pose_of(positions[:, k : k + POSE_SIZE], pose_sigma)
+
+
+def scaled_about(
+    model: Model,
+    positions: Float[Array, "s d"],
+    pose_sigma: Float[Array, "5"],
+    origin: Float[Array, "3"],
+    log_factor: Float[Array, "s"],
+) -> Float[Array, "s d"]:
+    """Positions whose shapes are scaled about a point: p -> origin + exp(log_factor) (p - origin), view frame.
+
+    Scaled about the camera a shape keeps its picture: what ray it is met on, in which order. Only ranges tell. The
+    positions' poses must be sampled.
+    """
+    at = model.latent + 2  # of x, y, log-scale, range offset, z
+    pose = pose_of(positions[:, model.latent : model.latent + POSE_SIZE], pose_sigma)
+    foot = jnp.stack([pose.x, pose.y, BASE_Z + pose.z], axis=-1)
+    shift = jnp.expm1(log_factor)[:, None] * (foot - origin)
+    moved = jnp.stack([shift[:, 0], shift[:, 1], log_factor, jnp.zeros_like(log_factor), shift[:, 2]], axis=-1)
+    return positions.at[:, at : at + 5].add(moved / jnp.maximum(pose_sigma, 1e-9))
 
 
 @jax.jit

@@ -23,6 +23,7 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from probnerf.hmc import HMCState, LogLikelihood, Metric, StageInfo, Target, gradient_metric, hmc_step, split_r_hat
+from probnerf.resampling import choose, next_beta
 from probnerf.types import Diagnostics, Posterior
 
 
@@ -86,50 +87,6 @@ def log_prior(q: Float[Array, "... d"]) -> Float[Array, "..."]:
     return -0.5 * jnp.sum(q * q + jnp.log(2 * jnp.pi), axis=-1)
 
 
-# Fractions of the remaining way to beta = 1, 40 a decade. A grid, as the ESS need not fall with beta under proposals.
-_FRACTIONS = np.geomspace(1e-9, 1.0, 361).astype(np.float32)
-
-
-def _ess(log_w: Float[Array, "n"]) -> Float[Array, ""]:
-    top = jnp.max(log_w)
-    w = jnp.exp(log_w - jnp.where(jnp.isfinite(top), top, 0.0))
-    return jnp.sum(w) ** 2 / jnp.maximum(jnp.sum(w * w), 1e-30)  # 0 if all weights are
-
-
-def _next_beta(beta, log_w, log_likelihood, enough):
-    """The largest beta at which the weights exp(log_w) L^step have ESS `enough`; their logarithms; their ESS.
-
-    Where none has (dead particles, poor proposals), the beta of the largest ESS; with no live particle at all, 1.
-    """
-
-    def weights(step):
-        return jnp.where(jnp.isfinite(log_likelihood), log_w + step * log_likelihood, -jnp.inf)
-
-    steps = (1.0 - beta) * _FRACTIONS
-    ess = jax.vmap(lambda step: _ess(weights(step)))(steps)
-    last = ess.size - 1
-    index = jnp.where(jnp.any(ess >= enough), last - jnp.argmax((ess >= enough)[::-1]), jnp.argmax(ess))
-    index = jnp.where(jnp.any(jnp.isfinite(log_likelihood)), index, last)
-    new = jnp.where(index == last, 1.0, beta + steps[index])  # in float32 beta + (1 - beta) need not be 1
-    return new, weights(new - beta), ess[index]
-
-
-def _resample(key, log_w, count: int):
-    """Systematic resampling: indices of `count` particles, each drawn count * w_i times up to rounding."""
-    top = jnp.max(log_w)
-    total = jnp.cumsum(jnp.where(jnp.isfinite(top), jnp.exp(log_w - top), 1.0))
-    u = (jnp.arange(count) + jax.random.uniform(key)) / count
-    u = jnp.minimum(u, 1.0 - 2.0**-24)  # rounding up to 1 would pass the last particle of positive weight
-    return jnp.searchsorted(total / total[-1], u, side="right")
-
-
-def _choose(key, log_w, pool, count: int):
-    """`count` particles of each population's weighted pool, resampled."""
-    keys = jax.random.split(key, log_w.shape[0])
-    index = jax.vmap(lambda k, w: _resample(k, w, count))(keys, log_w)
-    return jax.vmap(lambda tree, i: jax.tree.map(lambda a: a[i], tree))(pool, index)
-
-
 def _metrics(gradient, log_w, beta, config: TemperedSMCConfig) -> Metric:
     """Each population's metric, from the weighted pool of the population before it."""
     rank = min(config.moves * config.particles, gradient.shape[-1])
@@ -150,9 +107,9 @@ def _start(key, args, q0, log_w0, *, log_likelihood: LogLikelihood, config: Temp
 
     value = jnp.where(jnp.isfinite(log_w0), pool.log_likelihood, -jnp.inf)
     enough = config.ess_target * config.particles  # a number, so that a larger start buys a longer first step
-    beta, log_w, ess = jax.vmap(lambda w, v: _next_beta(jnp.zeros(()), w, v, enough))(log_w0, value)
+    beta, log_w, ess = jax.vmap(lambda w, v: next_beta(jnp.zeros(()), w, v, enough))(log_w0, value)
     ancestor = jnp.broadcast_to(jnp.arange(count), log_w.shape)
-    chain, ancestor = _choose(key, log_w, (pool, ancestor), config.particles)
+    chain, ancestor = choose(key, log_w, (pool, ancestor), config.particles)
     state = _State(
         chain=chain,
         beta=beta,
@@ -184,11 +141,11 @@ def _stage(key, state: _State, args, *, log_likelihood: LogLikelihood, config: T
     # [moves, m, p, ...] -> [m, moves p, ...]
     pool = jax.tree.map(lambda a: a.swapaxes(0, 1).reshape(config.populations, -1, *a.shape[3:]), pool)
     size = config.moves * config.particles
-    beta, log_w, ess = jax.vmap(lambda b, v: _next_beta(b, jnp.zeros(size), v, config.ess_target * size))(
+    beta, log_w, ess = jax.vmap(lambda b, v: next_beta(b, jnp.zeros(size), v, config.ess_target * size))(
         state.beta, pool.log_likelihood
     )
     ancestor = jnp.tile(state.ancestor, (1, config.moves))
-    chosen = _choose(resample_key, log_w, (pool, ancestor), config.particles)
+    chosen = choose(resample_key, log_w, (pool, ancestor), config.particles)
     tempering = state.beta < 1
     chain, ancestor = jax.tree.map(
         lambda a, b: jnp.where(tempering.reshape(-1, *[1] * (a.ndim - 1)), a, b), chosen, (chain, state.ancestor)
@@ -222,7 +179,7 @@ def tempered_smc(
     config: TemperedSMCConfig | None = None,
     *,
     initial: tuple[Float[Array, "m p0 d"], Float[Array, "m p0"]] | None = None,
-    on_stage: Callable[[StageInfo], None] | None = None,
+    on_stage: Callable[[StageInfo], bool | None] | None = None,
     deadline: float | None = None,
     stages: int | None = None,
 ) -> Posterior:
@@ -239,9 +196,12 @@ def tempered_smc(
     of the mean estimate; its error is the larger of two, one from the populations' spread (which is chance with only
     two) and one from the weights' variance stage by stage (which knows nothing of a mode that all particles missed).
 
-    result: "converged" (beta = 1 and all final stages), else "budget", "stages" or "interrupted" (Ctrl-C). A run
-    stopped before beta = 1 hands back equally weighted draws of the tempered target, which is wider than the posterior,
-    and NaN for the evidence. `point_gradients` counts gradient evaluations of whole positions.
+    After each stage `on_stage` is told of it, may ask for the samples so far, and ends the run by answering True.
+
+    result: "converged" (beta = 1 and all final stages), else "budget", "stages", "stopped" (by `on_stage`) or
+    "interrupted" (Ctrl-C); "underway" in samples asked for between stages. A run stopped before beta = 1 hands back
+    equally weighted draws of the tempered target, which is wider than the posterior, and NaN for the evidence.
+    `point_gradients` counts gradient evaluations of whole positions.
     """
     config = config or TemperedSMCConfig()
     begun = time.monotonic()
@@ -256,12 +216,21 @@ def tempered_smc(
     kept: list[HMCState] = []  # the pools of the final stages
     cap = config.max_stages if stages is None else min(stages, config.max_stages)
     done, divergences, shortest, acceptance, result = 0, 0, 0.0, float("nan"), "converged"
+
+    def samples(result: str = "underway") -> Posterior:
+        chains = kept or [state.chain]
+        return _posterior(config, state, chains, acceptance, divergences, done, gradients, result)
+
     try:
         while True:
             divergences += int(info.divergences)
+            ended = len(kept) == config.final_stages
             if on_stage is not None:
-                on_stage(_progress(done, state, info, divergences, time.monotonic() - begun))
-            if len(kept) == config.final_stages:
+                told = _progress(done, state, info, divergences, time.monotonic() - begun, samples)
+                if on_stage(told) and not ended:
+                    result = "stopped"
+                    break
+            if ended:
                 break
             now = time.monotonic()
             if done >= cap or (deadline is not None and now + shortest > deadline):
@@ -280,7 +249,7 @@ def tempered_smc(
             gradients += config.populations * config.particles * config.moves * config.leapfrog_steps
     except KeyboardInterrupt:
         result = "interrupted"
-    return _posterior(config, state, kept or [state.chain], acceptance, divergences, done, gradients, result)
+    return samples(result)
 
 
 def _checked(initial, config: TemperedSMCConfig, dim: int):
@@ -295,7 +264,7 @@ def _checked(initial, config: TemperedSMCConfig, dim: int):
     return q0, log_q0
 
 
-def _progress(stage: int, state: _State, info: _Info, divergences: int, seconds: float) -> StageInfo:
+def _progress(stage: int, state: _State, info: _Info, divergences: int, seconds: float, samples) -> StageInfo:
     def row(a) -> tuple[float, ...]:
         return tuple(np.asarray(a).tolist())
 
@@ -308,6 +277,7 @@ def _progress(stage: int, state: _State, info: _Info, divergences: int, seconds:
         log_evidence=row(state.log_evidence),
         divergences=divergences,
         seconds=seconds,
+        samples=samples,
     )
 
 
@@ -345,6 +315,8 @@ def _posterior(config, state: _State, kept: list[HMCState], acceptance, divergen
             ancestors=jnp.asarray(np.int32(sum(len(np.unique(row)) for row in np.asarray(state.ancestor)))),
             stages=jnp.asarray(np.int32(stages)),
             point_gradients=jnp.asarray(np.float32(gradients)),
+            beta=jnp.asarray(np.asarray(state.beta)),
+            log_evidences=jnp.asarray(estimates.astype(np.float32)),
         ),
         result=result,
     )

@@ -4,7 +4,11 @@ View frame: gravity-aligned (z up), origin at the cube's centre, +x pointing hor
 one unit = `half_extent` metres of the ObjectFrame. The support plane is z = BASE_Z. Metres stop at `perception`.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -47,6 +51,22 @@ class Observation(eqx.Module):
     def __check_init__(self) -> None:
         if self.colour_count > self.status.shape[0]:
             raise ValueError(f"colour_count {self.colour_count} exceeds the {self.status.shape[0]} rays")
+
+
+_PER_RAY = ("rays", "status", "rgb", "rgb_valid", "range", "range_sigma", "range_valid", "limit")
+
+
+def joined(observations: Sequence[Observation]) -> Observation:
+    """Several views of one object in one cube as one observation: their rays, and the first one's `pose_sigma`."""
+
+    def rows(o: Observation, part: slice) -> dict[str, Any]:
+        return {name: jax.tree.map(lambda a: a[part], getattr(o, name)) for name in _PER_RAY}
+
+    parts = [rows(o, slice(None, o.colour_count)) for o in observations]
+    parts += [rows(o, slice(o.colour_count, None)) for o in observations]
+    whole = jax.tree.map(lambda *a: jnp.concatenate(a), *parts)
+    count = sum(o.colour_count for o in observations)
+    return Observation(**whole, pose_sigma=observations[0].pose_sigma, colour_count=count)
 
 
 class Pose(eqx.Module):
@@ -96,6 +116,8 @@ class Diagnostics(eqx.Module):
     ancestors: Int[Array, ""]  # distinct initial particles that survive
     stages: Int[Array, ""]
     point_gradients: Float[Array, ""]  # field evaluations with gradient
+    beta: Float[Array, "m"]  # each population's (or chain's) inverse temperature: 1 is the posterior
+    log_evidences: Float[Array, "m"]  # each population's own estimate, of the target at its beta (NaN: it has none)
 
 
 class Posterior(eqx.Module):
@@ -108,4 +130,4 @@ class Posterior(eqx.Module):
     log_evidence: Float[Array, ""]  # mean over populations, NaN for samplers that have none
     log_evidence_se: Float[Array, ""]
     diagnostics: Diagnostics
-    result: str = eqx.field(static=True)  # why it stopped: "converged", "budget", "stages", "interrupted"
+    result: str = eqx.field(static=True)  # why it stopped: "converged", "budget", "stages", "stopped", "interrupted"

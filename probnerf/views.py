@@ -21,7 +21,7 @@ ENCODER_RADIUS = 1.25  # the encoder's picture shows this much around the cube's
 
 @dataclass(frozen=True)
 class ViewSet:
-    """Pictures of N objects, V views each, S pixels a side; range 0 marks a miss."""
+    """Pictures of N objects, V views each, S pixels a side; range 0 marks a miss, below 0 a hit of unknown range."""
 
     seeds: np.ndarray  # [N]
     rgb: np.ndarray  # u8 [N, V, S, S, 3]

@@ -9,7 +9,8 @@ import numpy as np
 
 from calibration.camera import Camera
 from perception.hypotheses import Hypotheses
-from perception.observe import observe, seen_voxels
+from perception.observe import observe
+from perception.seen import seen_voxels
 from perception.segment import Segment
 from perception.simulate import Placed, Scene, place_camera, simulate
 from perception.source import Frame
@@ -60,7 +61,7 @@ def mug_hypotheses(
         "pose": np.array([[yaw, 0.0, 0.0, scale, 0.0] for yaw in yaws], np.float32),
         "weights": np.array(weights),
         "population": np.arange(len(yaws)) % 2,
-        "seen": seen_voxels(frame, cube, grid),
+        "seen": seen_voxels(frame, found, cube, grid),
         "inside_view": True,
         "out_of_model": False,
         "stage": 7,

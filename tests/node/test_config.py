@@ -6,8 +6,8 @@ from typing import Literal
 
 import pytest
 
-from node.__main__ import Replay
 from node.config import from_mapping, load_config
+from node.options import Replay
 from node.pipeline import ReplayConfig
 
 LAUNCH = Path(__file__).resolve().parents[2] / "launch"
@@ -88,4 +88,4 @@ def test_the_launch_file_states_the_defaults() -> None:
 
 def test_every_option_of_replay_is_a_key_of_its_file() -> None:
     names = {f.name for f in fields(ReplayConfig)}
-    assert {f.name for f in fields(Replay)} - {"config"} == names - {"segment", "controller"}
+    assert {f.name for f in fields(Replay)} - {"config"} == names - {"segment", "controller", "track"}

@@ -31,7 +31,7 @@ def test_stages_make_a_run_repeatable(tmp_path: Path, method: str, capsys: pytes
         assert main([*run, "--out", str(tmp_path / out)]) == 0
     assert main([*run, "--out", str(tmp_path / "other"), "--seed", "1", "--object", "1"]) == 0
     assert "object 2" in capsys.readouterr().out
-    files = sorted(p.name for p in (tmp_path / "first").iterdir())
+    files = sorted(p.name for p in (tmp_path / "first").iterdir() if p.is_file())
     assert files == ["object_1.npz", "object_1.png", "object_2.npz", "object_2.png"]
     for name in ("object_1.npz", "object_2.npz"):
         assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()

@@ -41,6 +41,8 @@ def _hypotheses(opacity: np.ndarray, weights: list[float], **changes) -> Hypothe
         plane=np.array([0.0, -0.8, -0.6, 0.4]),
         xy_sigma=0.05,
         log_scale_sigma=0.1,
+        along_sigma=0.3,
+        sight_sigma=0.04,
     )
     h = Hypotheses(
         stamp_ns=1_700_000_000_123_456_789,

@@ -7,7 +7,7 @@ import pytest
 
 from perception.hypotheses import Hypotheses
 from perception.observe import ObjectFrame
-from perception.query import CAUTION, Box, Points, query, read_points
+from perception.query import CAUTION, Box, Points, Swept, query, read_points
 from probnerf.occupancy import voxel_centres
 
 GRID, HALF_EXTENT = 32, 0.16
@@ -213,6 +213,12 @@ def test_questions_that_mean_nothing_are_refused(mug):
         Box((0, 0, 0), (1, 1, 0))
     with pytest.raises(ValueError, match="not finite"):
         Box((0, 0, 0), (1, float("inf"), 1))
+    with pytest.raises(ValueError, match=r"beyond 1e\+06"):  # its volume would be infinite, and never be sampled
+        Box((-1e308, 0, 0), (1e308, 1, 1))
+    with pytest.raises(ValueError, match=r"up to 1e\+06"):
+        Points(np.array([[1e308, 0, 0]]))
+    with pytest.raises(ValueError, match=r"beyond 1e\+06"):
+        Swept(np.eye(4)[None], np.array([[1e308, 1.0, 1.0]]))
     with pytest.raises(ValueError, match="point 2 is"):
         Points(np.array([[0, 0, 0], [np.nan, 0, 0]]))
     with pytest.raises(ValueError, match=r"shape \[0, 3\]"):
@@ -248,3 +254,45 @@ def test_points_are_read_and_bad_lines_named(tmp_path):
         read_points(path)
     with pytest.raises(FileNotFoundError, match=r"absent\.xyz: no such file"):
         read_points(tmp_path / "absent.xyz")
+
+
+def _swept(*boxes: tuple[tuple[float, ...], tuple[float, ...]]) -> Swept:
+    """Axis-aligned boxes as swept ones."""
+    low, high = np.moveaxis(np.array(boxes), 1, 0)
+    T = np.tile(np.eye(4), (len(boxes), 1, 1))
+    T[:, :3, 3] = 0.5 * (low + high)
+    return Swept(T, high - low)
+
+
+def test_swept_boxes_are_one_region(mug):
+    """Both handles' places together: one of them is surely taken, whatever is swept twice counts once."""
+    both = query([mug], _swept(LEFT, RIGHT, LEFT), "object")
+    assert both.p_free == 0.0
+    assert both.volume_m3 == pytest.approx({"q05": HANDLE_M3, "q50": HANDLE_M3, "q95": HANDLE_M3})
+    assert both.unseen_fraction == pytest.approx(0.5, abs=0.02) and both.outside_fraction == 0.0
+    inner, outer = ((-0.01, -0.01, -0.01), (0.01, 0.01, 0.01)), ((0.5, 0.0, 0.0), (0.52, 0.02, 0.02))
+    assert query([mug], _swept(inner, outer), "object").outside_fraction == pytest.approx(0.5, abs=0.01)
+    far = query([mug], _swept(outer), "object")
+    assert far.p_free == 1.0 and far.outside_fraction == 1.0 and far.entropy_nats == 0.0
+
+
+def test_a_turned_thin_box_finds_its_voxels(mug):
+    """A blade of 0.1 mm across the left handle, turned 45 degrees, meets it as surely as the whole handle's box."""
+    T = np.eye(4)
+    T[:2, :2] = np.array([[1, -1], [1, 1]]) / np.sqrt(2)
+    T[:3, 3] = [0.07, 0.0, 0.0]
+    assert query([mug], Swept(T[None], np.array([[0.05, 1e-4, 0.05]])), "object").p_free == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize(
+    ("T", "size", "complaint"),
+    [
+        (np.eye(4), np.ones((1, 3)), "give"),
+        (np.eye(4)[None], np.zeros((1, 3)), "not longer than 0 m"),
+        (np.full((1, 4, 4), np.nan), np.ones((1, 3)), "not finite"),
+        (np.zeros((0, 4, 4)), np.zeros((0, 3)), "N"),
+    ],
+)
+def test_swept_boxes_are_checked(T, size, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        Swept(T, size)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from probnerf.hmc import StageInfo
-from probnerf.smc import TemperedSMCConfig, _next_beta, _resample, log_prior, tempered_smc
+from probnerf.resampling import next_beta, resample
+from probnerf.smc import TemperedSMCConfig, log_prior, tempered_smc
 from probnerf.types import Posterior
 
 CONFIG = TemperedSMCConfig(populations=4, particles=32, start_particles=128)
@@ -241,7 +242,7 @@ def test_systematic_resampling_copies_each_particle_its_due():
     for seed in range(20):
         log_w = np.where(rng.random(100) < 0.3, -np.inf, 3 * rng.normal(size=100))
         w = np.exp(log_w) / np.exp(log_w).sum()
-        counts = np.bincount(_resample(jax.random.key(seed), jnp.asarray(log_w, jnp.float32), 64), minlength=100)
+        counts = np.bincount(resample(jax.random.key(seed), jnp.asarray(log_w, jnp.float32), 64), minlength=100)
         assert counts.sum() == 64
         assert np.all(np.abs(counts - 64 * w) < 1 + 1e-4)
         assert np.all(counts[w == 0] == 0)
@@ -250,13 +251,13 @@ def test_systematic_resampling_copies_each_particle_its_due():
 def test_the_step_of_beta():
     value = jnp.asarray(np.random.default_rng(1).normal(size=256) * 100, jnp.float32)
     flat = jnp.zeros(256)
-    beta, log_w, ess = _next_beta(jnp.float32(0.2), flat, value, 128.0)
+    beta, log_w, ess = next_beta(jnp.float32(0.2), flat, value, 128.0)
     assert 128 <= float(ess) < 140
     np.testing.assert_allclose(log_w, (beta - 0.2) * value, rtol=1e-3)
-    assert float(_next_beta(jnp.float32(0.2), flat, value / 1e4, 128.0)[0]) == 1.0
+    assert float(next_beta(jnp.float32(0.2), flat, value / 1e4, 128.0)[0]) == 1.0
     # Most particles dead: the live ones are kept, and beta moves as little as it can.
     dead = jnp.where(jnp.arange(256) < 200, -jnp.inf, value)
-    beta, log_w, ess = _next_beta(jnp.float32(0.0), flat, dead, 128.0)
+    beta, log_w, ess = next_beta(jnp.float32(0.0), flat, dead, 128.0)
     assert 0 < float(beta) < 1e-6
     assert float(ess) == pytest.approx(56.0)
     assert np.all(np.isneginf(log_w[:200]))
