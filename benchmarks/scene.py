@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from calibration.camera import Camera
-from perception.observe import ObjectFrame, ObserveConfig, object_frame, seen_voxels
+from perception.observe import ObjectFrame, ObserveConfig, object_frame
+from perception.seen import seen_voxels
 from perception.segment import Segment, segment
 from perception.simulate import Picture, Placed, Scene, place_camera, render, sense, truth
 from perception.source import Frame
@@ -102,7 +103,7 @@ def hidden_vessel(seed: int, config: ViewConfig | None = None) -> HiddenVessel |
             segment=found,
             cube=cube,
             solid=coarsen(solid((body | handle).astype(np.float32)), GRID),
-            seen=seen_voxels(faultless, cube, GRID),
+            seen=seen_voxels(faultless, found, cube, GRID),
             near_handle=swept & ~coarsen(body, GRID),
         )
     return None

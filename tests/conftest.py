@@ -12,6 +12,7 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 os.environ.setdefault("DEPTHAI_LEVEL", "error")  # its warning about a missing USB bus
+os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")  # its handlers end the process; Python raises
 
 
 @pytest.fixture(scope="session")
@@ -21,3 +22,10 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("no recorded data: ../shared/data is not beside this checkout")
     return folder
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """A slow test may take a quarter of an hour: where nothing is compiled yet, or beside other work."""
+    for item in items:
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(900))

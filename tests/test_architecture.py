@@ -38,19 +38,26 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "optax": ("probnerf/train.py", "probnerf/variational.py", "probnerf/baselines/*"),
     "safetensors": ("probnerf/store.py",),
     "blackjax": (),  # an independent sampler to test against
-    "cv2": ("calibration/*", "perception/*"),
-    "scipy": ("probnerf/occupancy.py", "probnerf/batches.py", "probnerf/metrics.py", "perception/*", "benchmarks/*"),
+    "cv2": ("calibration/*", "perception/*", "probnerf/families/srn.py"),  # the last: PNG files, resized
+    "scipy": (
+        "node/message.py",
+        "probnerf/occupancy.py",
+        "probnerf/batches.py",
+        "probnerf/metrics.py",
+        "perception/*",
+        "benchmarks/*",
+    ),
     "skimage": ("probnerf/occupancy.py", "perception/*"),
     "serial": ("calibration/turntable.py",),
     "depthai": ("perception/oak.py",),
-    "rosbags": ("perception/log.py", "node/message.py"),  # recorded logs; messages on the bus
-    "mcap": ("perception/log.py",),
-    "yaml": ("calibration/camera.py", "node/config.py"),  # camera files; launch files
+    "rosbags": ("perception/log.py", "perception/record.py", "node/message.py"),  # recorded logs; messages on the bus
+    "mcap": ("perception/log.py", "perception/record.py"),
+    "yaml": ("calibration/camera_info.py", "node/config.py"),  # camera files; launch files
     "zenoh": ("node/bus.py",),
     "viser": ("node/page.py",),
-    "tyro": ("node/__main__.py", "benchmarks/*"),
+    "tyro": ("node/__main__.py", "node/options.py", "benchmarks/*"),
     "rich": ("node/*", "benchmarks/*"),
-    "matplotlib": ("node/plot.py", "benchmarks/*"),
+    "matplotlib": ("node/plot*.py", "benchmarks/*"),
 }
 
 CAN_EXECUTE_CODE = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve"}
