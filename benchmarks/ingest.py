@@ -33,6 +33,8 @@ from perception.query import Points, query
 from perception.record import Recorder
 from perception.segment import segment
 from perception.source import Frame
+from perception.track import Tracker
+from perception.warm import warm_up
 from probnerf.store import load_prior
 
 FPS = 30.0
@@ -124,7 +126,7 @@ def take_in(
 
 
 def inference() -> tuple[Callable[[Frame], None], Callable[[], None]]:
-    """One stage of the default posterior of a frame's first object, and a question; compiled and tried."""
+    """One stage of the default posterior of a frame's first object, and a question; as warm as the node begins."""
     prior, made = load_prior(), []
 
     def work(frame: Frame) -> None:
@@ -138,6 +140,7 @@ def inference() -> tuple[Callable[[Frame], None], Callable[[], None]]:
         query(made[-1:], points, "object")
 
     ask()
+    warm_up(Tracker(prior))
     return work, ask
 
 

@@ -5,6 +5,7 @@ A command's code is imported when it runs, so that help and mistyped options ans
 
 import inspect
 import os
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -222,6 +223,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     the process with the code.
     """
     if argv is None:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # a service's stop is a Ctrl-C
         _end(main(sys.argv[1:]))
     given = list(argv)
     args = [a for a in given if a != "--debug"]
@@ -244,11 +246,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print(f"farside: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         if "--debug" in given:
             raise
         print("farside: interrupted", file=sys.stderr)
+        _UNFINISHED.append(error)
         return 130
+
+
+# A Ctrl-C while jaxlib compiles leaves objects in its frames whose end may crash the process; they are not ended.
+_UNFINISHED: list[KeyboardInterrupt] = []
 
 
 def _end(code: int) -> NoReturn:

@@ -34,6 +34,7 @@ from perception.schedule import Scheduled, config_hash
 from perception.segment import Segment, SegmentConfig, segment
 from perception.source import Frame, Source, open_source
 from perception.track import Look, TrackConfig, Tracker
+from perception.warm import warm_up
 from probnerf.store import load_prior
 
 HYPOTHESES_TOPIC = "/farside/hypotheses"
@@ -78,7 +79,7 @@ def live(config: LiveConfig, out: Console, err: Console) -> None:
     use, or a file that cannot be written; at the end, too, where the recording had broken off. What goes wrong with one
     frame is said once and counted.
     """
-    prior = load_prior(config.prior)
+    tracker = Tracker(load_prior(config.prior), config.controller, config.track, config.seed)
     with ExitStack() as stack:
         bus = stack.enter_context(Bus(config.bus, lambda text: err.print(text, highlight=False, soft_wrap=True)))
         source = _open(config, bus)
@@ -100,9 +101,10 @@ def live(config: LiveConfig, out: Console, err: Console) -> None:
             lambda text: bus.counts.add("camera", "failed", text),
         )
         stack.callback(keeper.close)  # when the reader is closed, and what waits is written
+        with err.status("compiling; from the second start on it takes seconds"):
+            warm_up(tracker)  # before the first frame: its stalls would hold up the reader
         stack.enter_context(reader)
         keeper.thread.start()
-        tracker = Tracker(prior, config.controller, config.track, config.seed)
         node = Node(config, tracker, announcer, reader, keeper, recorder, err)
         node.answers.serve(bus)
         serve_parameters(bus, flat(config))

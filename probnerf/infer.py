@@ -75,7 +75,7 @@ class InferConfig:
 
 
 def likelihood_of(config: InferConfig, observation: Observation, sample_pose: bool = True) -> Likelihood:
-    """The likelihood's settings for one view; its sizes are padded, so that few of them compile."""
+    """The likelihood's settings for one view; its sizes are padded, so that most views share one compiled program."""
     lattice = foam.Lattice(config.lattice, config.extent, below=config.below)
     likelihood = Likelihood(
         lattice=lattice,
@@ -92,8 +92,8 @@ def likelihood_of(config: InferConfig, observation: Observation, sample_pose: bo
     def padded(count: int, step: int) -> int:
         return step * max(1, math.ceil(count / step))
 
-    most = min(padded(each.max(), 32), 3 * lattice.planes)
-    packed = (padded(each[: observation.colour_count].sum(), 256), padded(each.sum(), 512))
+    most = min(padded(each.max(), 64), 3 * lattice.planes)
+    packed = (padded(each[: observation.colour_count].sum(), 512), padded(each.sum(), 1024))
     return replace(likelihood, lattice=replace(lattice, max_crossings=most), packed=packed)
 
 

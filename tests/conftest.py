@@ -1,6 +1,7 @@
 """Tests run JAX on the CPU, reuse programs compiled by earlier runs, and read recorded data where there is some."""
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,9 @@ ROOT = Path(__file__).resolve().parent.parent
 os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+signal.signal(
+    signal.SIGINT, signal.default_int_handler
+)  # run in the background, children would inherit its being ignored
 os.environ.setdefault("DEPTHAI_LEVEL", "error")  # its warning about a missing USB bus
 os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")  # its handlers end the process; Python raises
 

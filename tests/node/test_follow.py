@@ -229,8 +229,7 @@ def test_record_on_a_full_disk_keeps_what_was_written(tmp_path: Path, capsys: py
 
 
 SLOW = """
-import signal, sys, time
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background hands down that it is ignored
+import sys, time
 import node.recording
 from tests.perception.test_record import frame
 class Camera:

@@ -71,7 +71,7 @@ def wait_for(planner: Bus, name: str, kind: str, request: Any, seconds: float = 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_driver_the_node_and_a_planner_in_three_processes(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_driver_the_node_and_a_planner_in_three_processes(tmp_path: Path) -> None:
     save_prior(tmp_path / "tiny.safetensors", ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {})
     port = free_port()
     config = tmp_path / "live.yaml"
@@ -99,10 +99,9 @@ def test_a_driver_the_node_and_a_planner_in_three_processes(tmp_path: Path, caps
                 ranked = wait_for(planner, "/farside/next_view", NEXT_VIEW, views)
                 assert len(ranked.poses) == 3 and (np.diff(ranked.gain_nats) <= 0).all()
                 until = time.monotonic() + 100.0
-                while len({h.object_id for h in heard}) < 2 and time.monotonic() < until:
+                while (done := _converged(heard)) != {1, 2} and time.monotonic() < until:
                     time.sleep(0.2)
-                seen = [hypotheses_from(message) for message in heard]
-                assert {h.object_id for h in seen} == {1, 2}
+                assert done == {1, 2}
                 assert any("/farside" in entity for entity in planner.graph())
                 camera.kill()
             node.send_signal(signal.SIGINT)
@@ -115,11 +114,15 @@ def test_a_driver_the_node_and_a_planner_in_three_processes(tmp_path: Path, caps
     assert len(recorded) == received and "0 dropped" in said  # every frame that came is in the recording
     assert inferred >= 2
     # and the recording repeats what was inferred live
-    assert (
-        main(["replay", str(log), "--schedule", *_for_replay(options, tmp_path), "--out", str(tmp_path / "out")]) == 0
-    )
-    repeated = capsys.readouterr().out
-    assert f"{inferred} of {inferred} inferences came out as they did" in repeated, repeated
+    again = ["replay", str(log), "--schedule", *_for_replay(options, tmp_path), "--out", str(tmp_path / "out")]
+    # a process of its own: with another number of devices sums are rounded otherwise
+    ended = subprocess.run([sys.executable, "-m", "node", *again], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert f"{inferred} of {inferred} inferences came out as they did" in ended.stdout, ended.stdout
+
+
+def _converged(messages: list) -> set[int]:
+    """The objects of which a last answer came."""
+    return {h.object_id for h in map(hypotheses_from, messages) if h.result == "converged"}
 
 
 def _for_replay(options: list[str], folder: Path) -> list[str]:

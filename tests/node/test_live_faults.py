@@ -1,6 +1,7 @@
 """Faults while `farside live` runs: they end in one line, spoil nothing recorded, and one bad frame ends nothing."""
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -103,25 +104,26 @@ import sys
 from node.__main__ import COMMANDS, main
 
 def interrupted(_):
-    import jax, os, signal, threading, time
+    import jax, os, threading, time
     def f(x):
         for i in range(400):
             x = jax.numpy.sin(x @ x) + jax.lax.cond(x.sum() > i, lambda y: y + i, jax.numpy.sort, x)
         return x
     lowered = jax.jit(f).lower(jax.numpy.ones((8, 8)))
-    threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+    threading.Timer(0.5, os.kill, (os.getpid(), int(sys.argv.pop()))).start()
     lowered.compile()
 
 COMMANDS["query"] = interrupted
-sys.argv = ["farside", "query"]
+sys.argv = ["farside", "query", *sys.argv[1:]]
 main()
 """
 
 
 @pytest.mark.slow
-def test_ctrl_c_while_it_compiles_ends_with_its_code(tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_while_it_compiles_ends_with_its_code(how: signal.Signals, tmp_path: Path) -> None:
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_NUM_CPU_DEVICES": "2"}
-    run = [sys.executable, "-c", PROGRAM]
+    run = [sys.executable, "-c", PROGRAM, str(int(how))]
     ended = subprocess.run(run, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
     assert (ended.returncode, ended.stderr) == (130, "farside: interrupted\n")
 

