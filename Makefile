@@ -40,9 +40,9 @@ lock: setup
 		--generate-hashes --custom-compile-command 'make lock' --quiet --output-file requirements.lock $(ARGS)
 
 clean:
-	rm -rf .venv .jax_cache .mypy_cache .pytest_cache .ruff_cache *.egg-info
+	rm -rf .venv probnerf/kernel/*.so .jax_cache .mypy_cache .pytest_cache .ruff_cache *.egg-info
 
-setup: .venv/.installed
+setup: .venv/.installed .venv/.kernel
 
 # The stamps are written last, so a set-up that was cut short is taken up again.
 .venv/.locked: requirements.lock
@@ -56,4 +56,9 @@ setup: .venv/.installed
 # Editable; setuptools would warn of that on every new machine.
 .venv/.installed: .venv/.locked pyproject.toml
 	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+# Without a C++ compiler this only says so: the kernel is never needed, it is several times faster.
+.venv/.kernel: .venv/.installed $(wildcard probnerf/kernel/*.cc probnerf/kernel/*.h) probnerf/kernel/build.py
+	$(BIN)/python -m probnerf.kernel.build
 	@touch $@

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, Shaped
 
-from probnerf import foam
-from probnerf.field import CylinderField, Field
+from probnerf import foam, fused
+from probnerf.field import CylinderField, Field, MLPField
 from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
 
 POSE_SIZE = 7
@@ -255,9 +255,30 @@ def log_likelihood(
 ) -> Float[Array, "p"]:
     """Batched log-likelihood for the samplers; differentiable in `positions` only.
 
-    Particles are shared out over JAX's devices where their number allows: one CPU core moves one particle at a time, so
-    a CPU counts as several devices (`JAX_NUM_CPU_DEVICES`).
+    The kernel evaluates an `MLPField` where it was built, particles shared out over threads. Without it they are shared
+    out over JAX's devices where their number allows: one CPU core moves one particle at a time, so a CPU counts as
+    several devices (`JAX_NUM_CPU_DEVICES`).
     """
+    if isinstance(args[0].field, MLPField) and fused.available():
+        return _fused(args, positions)
+    return plain_log_likelihood(args, positions)
+
+
+def _fused(args, positions):
+    model, likelihood, observation, t = args
+
+    def drawn(position):
+        weights, pose = split_position(model, likelihood, position, observation.pose_sigma)
+        offset = range_offset_of(model, likelihood, position, observation.pose_sigma)
+        place = jnp.zeros(5) if pose is None else jnp.stack([pose.yaw, pose.x, pose.y, pose.log_scale, pose.z])
+        return weights, jnp.append(place, offset)
+
+    weights, pose = jax.vmap(drawn)(positions)
+    return likelihood.power * fused.view_terms(model.field, likelihood, observation, t, weights, pose)
+
+
+def plain_log_likelihood(args, positions):
+    """`log_likelihood` in JAX alone: the kernel's reference, and what runs where there is no kernel."""
 
     def mapped(args, positions):
         # together: one by one, each would read the hypernetwork's weights through memory

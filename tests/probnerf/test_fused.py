@@ -1,0 +1,165 @@
+"""The fused kernel says what `pixel_terms` says in float64, with its gradients: any sizes, rays, instruction set."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from probnerf import fused
+from probnerf.field import MLPField
+from probnerf.foam import Lattice
+from probnerf.model import Likelihood, faces_of_view, log_likelihood, pixel_terms, plain_log_likelihood
+from probnerf.prior import PRESETS, ProbNeRF
+from probnerf.types import FREE, OBJECT, UNKNOWN, Observation, Pose, Rays
+
+ISAS = ("avx512", "avx2", "plain")
+FIELDS = {
+    "tiny": PRESETS["tiny"].field,
+    "small": PRESETS["small"].field,
+    "paper": PRESETS["paper"].field,
+    "odd": MLPField(width=21, octaves=4, direction_octaves=2, radial=True, waves=3),
+    "fitted": MLPField(width=80, octaves=1, direction_octaves=0, fitted=True),
+}
+
+
+@pytest.fixture(autouse=True)
+def built() -> None:
+    if not fused.available():
+        pytest.skip("the kernel is not built: there was no C++ compiler")
+
+
+def view(rays: int, colour: int, seed: int = 0) -> Observation:
+    """A view of every kind of pixel: with and without range and colour, free, unknown, padding; some miss the cube."""
+    rng = np.random.default_rng(seed)
+    origin = np.array([2.6, 0.2, 0.9]) + 0.05 * rng.normal(size=(rays, 3))
+    aim = rng.uniform(-0.8, 0.8, (rays, 3)) + (rng.random((rays, 1)) < 0.1) * np.array([0.0, 0.0, 9.0])
+    direction = (aim - origin) / np.linalg.norm(aim - origin, axis=1, keepdims=True)
+    status = rng.choice([OBJECT, OBJECT, OBJECT, FREE, UNKNOWN], rays)
+    status[colour:] = rng.choice([FREE, UNKNOWN], rays - colour)
+    limit = np.where(status == OBJECT, 0.0, rng.uniform(1.5, 4.0, rays)) * (rng.random(rays) < 0.8)
+    return Observation(
+        rays=Rays(jnp.asarray(origin, jnp.float32), jnp.asarray(direction, jnp.float32)),
+        status=jnp.asarray(status),
+        rgb=jnp.asarray(rng.random((rays, 3)), jnp.float32),
+        rgb_valid=jnp.asarray(rng.random(rays) < 0.8),
+        range=jnp.asarray(rng.uniform(1.6, 3.5, rays), jnp.float32),
+        range_sigma=jnp.full(rays, 0.02, jnp.float32),
+        range_valid=jnp.asarray(rng.random(rays) < 0.8),
+        limit=jnp.asarray(limit, jnp.float32),
+        pose_sigma=jnp.asarray([0.05, 0.05, 0.1, 0.02, 0.03]),
+        colour_count=colour,
+    )
+
+
+def drawn(field: MLPField, particles: int, density: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Random weights (with so much added to the density's last bias) and poses with a range offset."""
+    rng = np.random.default_rng(particles)
+    weights = rng.normal(size=(particles, field.size)) * field.weight_scale
+    last = sum(int(np.prod(shape)) for shape in field.shapes[:6]) - 1
+    weights[:, last] += density
+    pose = rng.normal(size=(particles, 6)) * [1.5, 0.05, 0.05, 0.1, 0.03, 0.02]
+    return weights.astype(np.float32), pose.astype(np.float32)
+
+
+def exact(field, likelihood, observation, t, weights, pose):
+    """Values and gradients of `pixel_terms` in float64."""
+    with jax.enable_x64(True):
+
+        def double(tree):
+            return jax.tree.map(lambda a: jnp.asarray(a, jnp.float64) if a.dtype == jnp.float32 else a, tree)
+
+        def one(w, p):
+            return jnp.sum(pixel_terms(field, w, Pose(*p[:5]), likelihood, double(observation), double(t), p[5]))
+
+        found = jax.jit(jax.vmap(jax.value_and_grad(one, argnums=(0, 1))))(*double((weights, pose)))
+        return jax.tree.map(np.asarray, (found[0], *found[1]))
+
+
+def assert_close(found, expected) -> None:
+    np.testing.assert_allclose(found[0], expected[0], rtol=1e-5)
+    for slope, true in zip(found[1:], expected[1:], strict=True):
+        scale = np.abs(true).max(axis=-1, keepdims=True)  # a gradient's small entries are differences of large ones
+        np.testing.assert_allclose(slope / scale, true / scale, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_it_is_the_plain_computation_for_fields_of_any_size(name: str) -> None:
+    field, observation = FIELDS[name], view(37, 20)
+    likelihood = Likelihood(Lattice(8, 1.1, below=0.15), reach=0.3)
+    t = faces_of_view(observation, likelihood)
+    weights, pose = drawn(field, 3)
+    found = jax.jit(lambda w, p: fused.call(field, likelihood, observation, t, w, p))(weights, pose)
+    assert_close(found, exact(field, likelihood, observation, t, weights, pose))
+
+
+@pytest.mark.parametrize(
+    ("rays", "colour", "cubes", "density"), [(1, 1, 32, 0.0), (5, 0, 16, 0.0), (64, 32, 64, -9.0), (33, 33, 24, 6.0)]
+)
+def test_odd_counts_long_rays_empty_and_saturated_ones(rays: int, colour: int, cubes: int, density: float) -> None:
+    field, observation = FIELDS["odd"], view(rays, colour, seed=rays)
+    likelihood = Likelihood(Lattice(cubes, 1.1, below=0.15), outlier=0.01, wall_sigma=0.05)
+    t = faces_of_view(observation, likelihood)
+    weights, pose = drawn(field, 2, density)
+    found = fused.call(field, likelihood, observation, t, jnp.asarray(weights), jnp.asarray(pose))
+    assert_close(found, exact(field, likelihood, observation, t, weights, pose))
+
+
+def test_a_view_that_says_nothing_is_zero() -> None:
+    observation = view(8, 4)
+    silent = replace(observation, status=jnp.full(8, UNKNOWN), limit=jnp.zeros(8))
+    likelihood = Likelihood(Lattice(8))
+    weights, pose = drawn(FIELDS["tiny"], 2)
+    found = fused.call(FIELDS["tiny"], likelihood, silent, faces_of_view(silent, likelihood), weights, pose)
+    assert not any(np.asarray(a).any() for a in found)
+
+
+def test_neither_threads_nor_the_instruction_set_change_the_answer() -> None:
+    field, observation = FIELDS["small"], view(37, 20)
+    likelihood = Likelihood(Lattice(16, 1.1, below=0.15))
+    t = faces_of_view(observation, likelihood)
+    weights, pose = map(jnp.asarray, drawn(field, 5))
+    call = partial(fused.call, field, likelihood, observation, t, weights, pose)
+    whole = call(threads=1)
+    for threads in (2, 3, 8):
+        for a, b in zip(call(threads=threads), whole, strict=True):
+            np.testing.assert_array_equal(a, b)  # to the last bit
+    expected = exact(field, likelihood, observation, t, weights, pose)
+    for isa in ISAS:
+        try:
+            found = jax.block_until_ready(call(isa=isa))
+        except jax.errors.JaxRuntimeError as error:
+            assert "no instruction set" in str(error) and isa != "plain"
+            continue
+        assert_close(found, expected)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="no instruction set nonesuch"):
+        jax.block_until_ready(call(isa="nonesuch"))
+
+
+@pytest.mark.parametrize(("sample_pose", "sample_delta"), [(True, False), (False, False), (True, True)])
+def test_samplers_get_the_same_density_and_gradient(sample_pose: bool, sample_delta: bool) -> None:
+    model = ProbNeRF(PRESETS["tiny"], jax.random.key(0))
+    observation = view(37, 20)
+    likelihood = Likelihood(Lattice(8), power=0.5, sample_pose=sample_pose, sample_delta=sample_delta)
+    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
+    positions = 0.5 * jax.random.normal(jax.random.key(1), (3, likelihood.dim(model)))
+
+    def both(function):
+        value, pullback = jax.vjp(lambda q: function(args, q), positions)
+        return np.asarray(value), np.asarray(pullback(jnp.array([1.0, -2.0, 0.5]))[0])
+
+    (value, gradient), (expected, slope) = both(log_likelihood), both(plain_log_likelihood)
+    np.testing.assert_allclose(value, expected, rtol=1e-5)
+    np.testing.assert_allclose(gradient, slope, rtol=1e-3, atol=2e-4 * np.abs(slope).max())
+
+
+def test_without_the_kernel_the_plain_path_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, observation = ProbNeRF(PRESETS["tiny"], jax.random.key(0)), view(9, 5)
+    likelihood = Likelihood(Lattice(8))
+    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
+    positions = jax.random.normal(jax.random.key(1), (2, likelihood.dim(model)))
+    monkeypatch.setattr(fused, "available", lambda: False)
+    monkeypatch.setattr(fused, "call", None)
+    np.testing.assert_array_equal(log_likelihood(args, positions), plain_log_likelihood(args, positions))
