@@ -18,6 +18,7 @@ from probnerf.families.render import look_at, pinhole_rays
 from probnerf.hmc import StageInfo
 from probnerf.infer import (
     InferConfig,
+    crossings_of,
     explained,
     infer,
     likelihood_of,
@@ -206,7 +207,7 @@ def published(
             "beta": float(d.beta.min()),
             "log_evidence": float(posterior.log_evidence),
             "log_evidence_se": float(posterior.log_evidence_se),
-            "point_gradients": float(d.point_gradients) * likelihood.packed[1],
+            "point_gradients": float(d.point_gradients) * crossings_of(likelihood, view.observation),
             "explained": fit,
             "power": likelihood.power,
             "evidence_power": config.infer.smc.evidence_power,

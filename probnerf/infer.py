@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from probnerf import foam
+from probnerf import foam, fused
 from probnerf.hmc import AnnealedHMCConfig, StageInfo, annealed_hmc
 from probnerf.model import (
     POSE_SIZE,
@@ -75,7 +75,7 @@ class InferConfig:
 
 
 def likelihood_of(config: InferConfig, observation: Observation, sample_pose: bool = True) -> Likelihood:
-    """The likelihood's settings for one view; its sizes are padded, so that most views share one compiled program."""
+    """The likelihood's settings for one view, with its sizes where there is no kernel (`with_sizes`)."""
     lattice = foam.Lattice(config.lattice, config.extent, below=config.below)
     likelihood = Likelihood(
         lattice=lattice,
@@ -87,6 +87,14 @@ def likelihood_of(config: InferConfig, observation: Observation, sample_pose: bo
         sample_pose=sample_pose,
         sample_delta=config.sample_delta,
     )
+    return likelihood if fused.available() else with_sizes(likelihood, observation)
+
+
+def with_sizes(likelihood: Likelihood, observation: Observation) -> Likelihood:
+    """The settings with one view's number of crossings, which plain JAX packs: padded, so that most views share one
+    compiled program.
+    """
+    lattice = likelihood.lattice
     each = np.sum(np.asarray(faces_of_view(observation, likelihood)) < foam.FAR, axis=1)
 
     def padded(count: int, step: int) -> int:
@@ -95,6 +103,11 @@ def likelihood_of(config: InferConfig, observation: Observation, sample_pose: bo
     most = min(padded(each.max(), 64), 3 * lattice.planes)
     packed = (padded(each[: observation.colour_count].sum(), 512), padded(each.sum(), 1024))
     return replace(likelihood, lattice=replace(lattice, max_crossings=most), packed=packed)
+
+
+def crossings_of(likelihood: Likelihood, observation: Observation) -> int:
+    """Crossings of a view at which the field is evaluated for each particle."""
+    return int(np.sum(np.asarray(faces_of_view(observation, likelihood)) < foam.FAR))
 
 
 def without_sizes(likelihood: Likelihood) -> Likelihood:

@@ -1,0 +1,171 @@
+"""The fused kernel: operations a second beside the machine's matrix products and beside the same work in plain JAX.
+
+One value and gradient of the pixel likelihood for every particle. All paths and the machine's own matrix product are
+timed in turn, round after round, and medians are given: their ratios hold on a machine that does other work, too.
+
+- operations: two for each multiply-add of the two networks at the crossings that a pixel can tell of, times three
+  (forwards, and backwards by inputs and by weights); encodings, compositing and the likelihood's terms are not counted.
+- least_bytes: weights in and their gradient out; what the fused operation has to move. stored_bytes: every layer's
+  values at every crossing, which the plain path writes and reads again.
+- share_of_peak: of the machine's single-precision matrix product, 4096 x 4096, in the same rounds.
+- ratio: seconds of the plain path over seconds of the kernel's, both with the hypernetwork and its gradient.
+"""
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.rows import Row
+from benchmarks.summary import say
+from perception.log import Log
+from perception.observe import observe
+from perception.segment import segment
+from perception.source import SHIPPED_LOG
+from probnerf import fused
+from probnerf.field import MLPField, encoded_size
+from probnerf.foam import FAR
+from probnerf.infer import InferConfig, likelihood_of, with_sizes
+from probnerf.model import faces_of_view, log_likelihood, plain_log_likelihood
+from probnerf.prior import PRESETS, ProbNeRF
+from probnerf.store import load_prior
+from probnerf.types import OBJECT, Observation, joined
+
+SIDE = 4096  # of the matrices whose product is the machine's peak
+
+
+def main(out: Path, quick: bool = False, repeats: int = 9) -> list[Row]:
+    """The kernel's speed beside plain JAX and the machine's matrix products.
+
+    Args:
+        repeats: rounds, of which medians are given (quick: 3)
+    """
+    if repeats < 1:
+        raise ValueError(f"repeats is {repeats}; give 1 or more")
+    if not fused.available():
+        raise ValueError("the kernel is not built: install a C++ compiler, then `make setup`")
+    repeats = min(repeats, 3) if quick else repeats
+    frame = next(iter(Log(SHIPPED_LOG)))
+    view, _ = observe(frame, segment(frame)[0])
+    shipped = load_prior().model
+    cases = {"small, 384 particles x 64 rays": (shipped, view, 384)}
+    if not quick:
+        cases["small, 8 particles x 512 rays"] = (shipped, joined([view] * 8), 8)
+        paper = ProbNeRF(PRESETS["paper"], jax.random.key(0))
+        cases["paper, 8 particles x 512 rays"] = (paper, joined([view] * 8), 8)
+    rows = []
+    for condition, (model, observation, particles) in cases.items():
+        say(condition)
+        rows += _measure(condition, model, observation, particles, repeats)
+    _draw(rows, out / "kernel.png")
+    return rows
+
+
+def _measure(condition: str, model: ProbNeRF, observation: Observation, particles: int, repeats: int) -> list[Row]:
+    likelihood = likelihood_of(InferConfig(), observation)
+    t = faces_of_view(observation, likelihood)
+    points, coloured = _told(observation, np.asarray(t))
+    field = model.field
+    operations = 6.0 * particles * (points * _density_size(field) + coloured * _colour_size(field))
+    layers = encoded_size(field.octaves, 3 + field.radial) + 2 * field.width
+    stored = 4.0 * particles * (points + coloured) * layers
+    packed = with_sizes(likelihood, observation)
+    args = (model, likelihood, observation, t)
+    plain_args = (model, packed, observation, faces_of_view(observation, packed))
+    positions = 0.5 * jax.random.normal(jax.random.key(0), (particles, likelihood.dim(model)))
+    weights = jax.jit(jax.vmap(model.decode))(positions[:, : model.latent])
+    pose = jnp.zeros((particles, 6))
+    matrix = jnp.ones((SIDE, SIDE), jnp.float32)
+
+    def whole(function: Callable, args: tuple) -> Callable:
+        return jax.jit(lambda q: jax.value_and_grad(lambda v: function(args, v).sum())(q))
+
+    def kernel(threads: int | None = None, isa: str = "") -> Callable:
+        return jax.jit(lambda w: fused.call(field, likelihood, observation, t, w, pose, threads, isa))
+
+    runs: dict[str, tuple[Callable, jax.Array]] = {
+        "matrix product": (jax.jit(lambda a: a @ a), matrix),
+        "kernel": (kernel(), weights),
+        "kernel, one thread": (kernel(1), weights),
+        "kernel with hypernetwork": (whole(log_likelihood, args), positions),
+        "plain JAX with hypernetwork": (whole(plain_log_likelihood, plain_args), positions),
+    }
+    for isa in ("avx2", "plain"):
+        try:
+            jax.block_until_ready(kernel(isa=isa)(weights))
+        except jax.errors.JaxRuntimeError:  # another kind of machine
+            continue
+        runs[f"kernel, {isa}"] = (kernel(isa=isa), weights)
+    seconds = _timed(runs, repeats)
+    peak = 2.0 * SIDE**3 / seconds["matrix product"]
+    rows = [
+        Row("kernel", "work", condition, "points", points * particles, "", particles),
+        Row("kernel", "work", condition, "coloured_points", coloured * particles, "", particles),
+        Row("kernel", "work", condition, "operations", operations * 1e-9, "GFLOP", particles),
+        Row("kernel", "work", condition, "least_bytes", 8e-6 * particles * field.size, "MB", particles),
+        Row("kernel", "work", condition, "stored_bytes", stored * 1e-6, "MB", particles),
+        Row("kernel", "matrix product", condition, "speed", peak * 1e-9, "GFLOP/s", repeats),
+    ]
+    for method, taken in seconds.items():
+        if method != "matrix product":
+            rows.append(Row("kernel", method, condition, "time", 1e3 * taken, "ms", repeats))
+            rows.append(Row("kernel", method, condition, "share_of_peak", operations / taken / peak, "", repeats))
+    ratio = seconds["plain JAX with hypernetwork"] / seconds["kernel with hypernetwork"]
+    return [*rows, Row("kernel", "kernel with hypernetwork", condition, "ratio", ratio, "", repeats)]
+
+
+def _timed(runs: dict[str, tuple[Callable, jax.Array]], repeats: int) -> dict[str, float]:
+    """Median seconds of each, one after the other in every round."""
+    taken: dict[str, list[float]] = {name: [] for name in runs}
+    for repeat in range(-1, repeats):  # the first one compiles
+        for name, (function, given) in runs.items():
+            begun = time.perf_counter()
+            jax.block_until_ready(function(given))
+            if repeat >= 0:
+                taken[name].append(time.perf_counter() - begun)
+    return {name: float(np.median(values)) for name, values in taken.items()}
+
+
+def _told(observation: Observation, t: np.ndarray) -> tuple[int, int]:
+    """Crossings at which density is needed, and colour."""
+    each = (t < FAR).sum(axis=1)
+    first = np.arange(len(each)) < observation.colour_count
+    is_object = first & (np.asarray(observation.status) == OBJECT)
+    told = is_object | (np.asarray(observation.limit) > 0)
+    return int(each[told].sum()), int(each[is_object & np.asarray(observation.rgb_valid)].sum())
+
+
+def _density_size(field: MLPField) -> int:
+    """Multiply-adds of the density network at one point."""
+    h = field.width
+    return encoded_size(field.octaves, 3 + field.radial) * h + h * h + h
+
+
+def _colour_size(field: MLPField) -> int:
+    """... of the colour network; what the direction adds is the same for a whole ray."""
+    h = field.width
+    return (encoded_size(field.octaves, 3 + field.radial) + 1 + 2 * field.waves) * h + h * h + 3 * h
+
+
+def _draw(rows: list[Row], path: Path) -> None:
+    """Shares of the peak, by path and case."""
+    shares = [row for row in rows if row.metric == "share_of_peak"]
+    conditions = list(dict.fromkeys(row.condition for row in shares))
+    methods = list(dict.fromkeys(row.method for row in shares))
+    figure = Figure(figsize=(8, 1.2 + 0.22 * len(shares)), layout="constrained")
+    ax = figure.subplots()
+    for i, condition in enumerate(conditions):
+        there = [row for row in shares if row.condition == condition]
+        at = [methods.index(row.method) + 0.8 * (i - (len(conditions) - 1) / 2) / len(conditions) for row in there]
+        ax.barh(at, [100 * row.value for row in there], height=0.8 / len(conditions), label=condition)
+    ax.set_yticks(range(len(methods)), methods)
+    ax.invert_yaxis()
+    ax.set(xlabel=f"share of the machine's matrix product, % ({os.cpu_count()} cores)", xlim=(0, 100))
+    ax.legend(fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
