@@ -149,7 +149,7 @@ def _density_size(field: MLPField) -> int:
 def _colour_size(field: MLPField) -> int:
     """... of the colour network; what the direction adds is the same for a whole ray."""
     h = field.width
-    return (encoded_size(field.octaves, 3 + field.radial) + 1 + 2 * field.waves) * h + h * h + 3 * h
+    return (encoded_size(field.octaves, 3 + field.radial) + 1) * h + h * h + 3 * h
 
 
 def _draw(rows: list[Row], path: Path) -> None:

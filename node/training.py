@@ -24,7 +24,6 @@ from probnerf import foam
 from probnerf import train as training
 from probnerf.families.srn import read_views
 from probnerf.families.tabletop import TRAIN_SEEDS
-from probnerf.grow import grow
 from probnerf.model import Likelihood
 from probnerf.prior import PRESETS, ProbNeRF
 from probnerf.solids import Solids, draw_solids
@@ -71,7 +70,7 @@ def train(options: Training, out: Console, err: Console) -> bool:
         raise ValueError(f"--pictures is {options.pictures}; give 1 or more")
     begun = None if options.start is None else load_prior(options.start, preset=options.preset)
     key = np.array([0, config.seed], np.uint32)  # a raw key
-    model = ProbNeRF(preset, key) if begun is None else grow(begun.model, preset, key)  # type: ignore[arg-type]
+    model = ProbNeRF(preset, key) if begun is None else begun.model  # type: ignore[arg-type]
     history, curves, weights = folder / "history.jsonl", folder / "curves.png", folder / "prior.safetensors"
     likelihood = Likelihood(lattice=foam.Lattice(preset.lattice, 1.0, 9 * preset.lattice // 4))
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())

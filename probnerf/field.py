@@ -97,8 +97,7 @@ def with_radius(x: Float[Array, "3 n"]) -> Float[Array, "4 n"]:
     return jnp.concatenate([x, jnp.sqrt(x[:1] ** 2 + x[1:2] ** 2 + 1e-4)], axis=0)
 
 
-# Natural sizes of a fitted field's log-stretch and shift (cube units), and of wave vectors (radians per cube unit).
-STRETCH, SHIFT, WAVE = 0.3, 0.1, 8.0
+STRETCH, SHIFT = 0.3, 0.1  # natural sizes of the fitted field's log-stretch and shift (cube units)
 
 
 def _octave_scale(octaves: int, channels: int) -> np.ndarray:
@@ -116,18 +115,16 @@ class MLPField(eqx.Module):
     direction_octaves: int = eqx.field(static=True, default=10)
     density_scale: float = eqx.field(static=True, default=64.0)  # sigma = density_scale * softplus(output)
     radial: bool = eqx.field(static=True, default=False)  # also encode the distance from the axis (not in the paper)
-    fitted: bool = eqx.field(static=True, default=False)  # six more weights stretch and shift the points (nor this)
-    waves: int = eqx.field(static=True, default=0)  # plane waves of the object's own that colour sees (nor this)
+    fitted: bool = eqx.field(static=True, default=False)  # the last six weights stretch and shift the points (nor this)
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:
         """Kernel and bias shapes in the order of the flat vector: density MLP, colour MLP; log-stretch and shift."""
         position, direction = encoded_size(self.octaves, 3 + self.radial), encoded_size(self.direction_octaves)
         h = self.width
-        layers = [(position, h), (h, h), (h, 1), (position + direction + 1 + 2 * self.waves, h)]
-        layers += [(h, h), (h, 3)]
+        layers = [(position, h), (h, h), (h, 1), (position + direction + 1, h), (h, h), (h, 3)]
         shapes: list[tuple[int, ...]] = [shape for kernel in layers for shape in (kernel, kernel[1:])]
-        return shapes + [(3,), (3,)] * self.fitted + [(3, self.waves)] * (self.waves > 0)
+        return shapes + [(3,), (3,)] * self.fitted
 
     @property
     def size(self) -> int:
@@ -149,13 +146,11 @@ class MLPField(eqx.Module):
             rest = np.ones(scale[index].shape[0] - sum(map(len, rows)))
             scale[index] *= np.concatenate([*rows, rest])[:, None]
         if self.fitted:
-            scale[12:14] = [np.full(3, STRETCH), np.full(3, SHIFT)]
-        if self.waves:
-            scale[-1] = np.full(3 * self.waves, WAVE)
+            scale[12:] = [np.full(3, STRETCH), np.full(3, SHIFT)]
         return np.concatenate([part.ravel() for part in scale]).astype(np.float32)
 
     def unpack(self, weights: Float[Array, "d"]) -> list[Array]:
-        """The flat vector as twelve arrays, two more where the field is fitted, and one of wave vectors."""
+        """The flat vector as twelve arrays, and two more where the field is fitted."""
         parts, start = [], 0
         for shape in self.shapes:
             end = start + math.prod(shape)
@@ -163,24 +158,21 @@ class MLPField(eqx.Module):
             start = end
         return parts
 
-    def _fit(self, parts: list[Array], points: Float[Array, "... 3"]) -> Float[Array, "3 n"]:
-        """A fitted field first undoes the object's own stretch and shift about its support point: sizes and slack are
-        then six numbers, not a change of every weight.
+    def _place(self, parts: list[Array], points: Float[Array, "... 3"]) -> Float[Array, "e n"]:
+        """Encoded points. A fitted field first undoes the object's own stretch and shift about its support point:
+        sizes and slack are then six numbers, not a change of every weight.
         """
         x = _columns(points)
         if self.fitted:
-            stretch, shift = parts[12:14]
+            stretch, shift = parts[12:]
             base = jnp.array([[0.0], [0.0], [BASE_Z]])
             x = (x - base - shift[:, None]) * jnp.exp(stretch)[:, None] + base
-        return x
-
-    def _place(self, x: Float[Array, "3 n"]) -> Float[Array, "e n"]:
         return encode(with_radius(x) if self.radial else x, self.octaves)
 
     def density(self, weights: Float[Array, "d"], points: Float[Array, "... 3"]) -> Float[Array, "..."]:
         """sigma = density_scale * softplus(MLP(encode(x)))."""
         parts = self.unpack(weights)
-        output = _mlp(self._place(self._fit(parts, points)), *parts[:6])
+        output = _mlp(self._place(parts, points), *parts[:6])
         return self.density_scale * jax.nn.softplus(output[0]).reshape(points.shape[:-1])
 
     def colour(
@@ -190,15 +182,10 @@ class MLPField(eqx.Module):
         directions: Float[Array, "... 3"],
         sigma: Float[Array, "..."],
     ) -> Float[Array, "... 3"]:
-        """RGB from encode(x), encode(v), log(1 + sigma) (its logarithm: sigma spans 0 to thousands), and waves.
-
-        A band or a print has a pitch of its own; octaves of fixed pitch would have to be re-mixed for each object.
-        """
+        """RGB from encode(x), encode(v) and log(1 + sigma) (its logarithm: sigma spans 0 to thousands)."""
         parts = self.unpack(weights)
-        x = self._fit(parts, points)
-        inputs = [self._place(x), encode(_columns(directions), self.direction_octaves), jnp.log1p(sigma).reshape(1, -1)]
-        if self.waves:
-            inputs += sincospi(parts[-1].T @ x / jnp.pi)
+        seen = encode(_columns(directions), self.direction_octaves)
+        inputs = [self._place(parts, points), seen, jnp.log1p(sigma).reshape(1, -1)]
         output = _mlp(jnp.concatenate(inputs, axis=0), *parts[6:12])
         return jax.nn.sigmoid(output).T.reshape(points.shape)
 

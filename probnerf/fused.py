@@ -62,7 +62,6 @@ def call(field, likelihood, observation, t, weights, pose, threads: int | None =
         "direction_octaves": field.direction_octaves,
         "radial": field.radial,
         "fitted": field.fitted,
-        "waves": field.waves,
         "colour_count": observation.colour_count,
         "threads": threads or os.cpu_count() or 1,
     }

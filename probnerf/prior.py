@@ -36,7 +36,6 @@ class Preset:
     encoder_channels: tuple[int, ...]
     radial: bool = False  # the field also sees the distance from the body's axis
     fitted: bool = False  # the field's first map stretches and shifts the points
-    waves: int = 0  # plane waves of the object's own that colour sees
     smooth: bool = False  # SiLU in the hypernetwork, where the paper has ReLU
 
     @property
@@ -48,7 +47,6 @@ class Preset:
             direction_octaves=self.direction_octaves,
             radial=self.radial,
             fitted=self.fitted,
-            waves=self.waves,
         )
 
 
@@ -56,7 +54,7 @@ PRESETS = {
     preset.name: preset
     for preset in (
         Preset("paper", 128, 64, 10, 10, 512, 512, 128, 128, (32, 64, 128, 128, 128)),
-        Preset("small", 48, 48, 6, 1, 128, 256, 32, 32, (24, 32, 48, 64, 128), True, True, smooth=True, waves=6),
+        Preset("small", 48, 48, 6, 1, 128, 256, 32, 32, (24, 32, 48, 64, 128), radial=True, fitted=True, smooth=True),
         Preset("tiny", 4, 8, 2, 1, 16, 16, 8, 16, (4, 4, 4, 4, 4)),  # for tests
     )
 }

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import os
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from probnerf.prior import PRESETS, Preset, ProbNeRF
+from probnerf.prior import PRESETS, ProbNeRF
 
 FORMAT = "farside-prior-1"
 SHIPPED = Path(__file__).parent / "weights" / "tabletop.safetensors"
@@ -35,22 +35,11 @@ def _named(model: ProbNeRF) -> dict[str, Any]:
 def save_prior(path: Path, model: ProbNeRF, metadata: dict[str, Any]) -> None:
     """Write atomically. `metadata` must be JSON-serialisable."""
     arrays = {name: np.ascontiguousarray(leaf) for name, leaf in _named(model).items()}
-    story = {"format": FORMAT, "preset": model.preset.name, "sizes": asdict(model.preset), **metadata}
+    story = {"format": FORMAT, "preset": model.preset.name, **metadata}
     data = save(arrays, metadata={"farside": json.dumps(story, sort_keys=True)})
     temporary = path.with_suffix(".tmp")
     temporary.write_bytes(data)
     os.replace(temporary, path)
-
-
-def _sizes(path: Path, story: dict[str, Any]) -> Preset:
-    """The file's own sizes. One that does not state them is older than waves."""
-    if "sizes" not in story:
-        return replace(PRESETS[story["preset"]], waves=0)
-    sizes: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in story["sizes"].items()}
-    try:
-        return Preset(**sizes)
-    except TypeError as error:
-        raise ValueError(f"{path}: its sizes are not this version's ({error}); train it again") from None
 
 
 def load_prior(path: Path | None = None, preset: str | None = None) -> Prior:
@@ -71,7 +60,7 @@ def load_prior(path: Path | None = None, preset: str | None = None) -> Prior:
         raise ValueError(f"{path} is not a prior of format {FORMAT} with a preset of {', '.join(PRESETS)}")
     if preset is not None and story["preset"] != preset:
         raise ValueError(f"{path} holds preset '{story['preset']}', not '{preset}'; give weights of that preset")
-    model = ProbNeRF(_sizes(path, story), jax.random.key(0))
+    model = ProbNeRF(PRESETS[story["preset"]], jax.random.key(0))
     named = _named(model)
     for name, leaf in named.items():
         found = arrays.get(name)

@@ -55,7 +55,7 @@ using F32Result = ffi::Result<F32>;
 static ffi::Error view_terms(F32 weights, F32 pose, F32 origin, F32 direction, F32 t, F32 rgb, F32 range,
                              F32 range_sigma, F32 limit, S32 status, S32 rgb_valid, S32 range_valid, F32Result values,
                              F32Result g_weights, F32Result g_pose, int32_t width, int32_t octaves,
-                             int32_t direction_octaves, int32_t radial, int32_t fitted, int32_t waves,
+                             int32_t direction_octaves, int32_t radial, int32_t fitted,
                              float density_scale, float mask_error, float outlier, float outlier_span,
                              float wall_sigma, float colour_sigma, float per_density, int32_t colour_count,
                              int32_t threads, std::string_view isa) {
@@ -64,7 +64,7 @@ static ffi::Error view_terms(F32 weights, F32 pose, F32 origin, F32 direction, F
   const Code* chosen = code(isa);
   if (!chosen) return ffi::Error::InvalidArgument("this machine has no instruction set " + std::string(isa));
   int64_t particles = rows[0], size = rows[1];
-  FieldSizes field{width, octaves, direction_octaves, radial, fitted, waves, density_scale};
+  FieldSizes field{width, octaves, direction_octaves, radial, fitted, density_scale};
   PixelModel model{mask_error, outlier, outlier_span, wall_sigma, colour_sigma, per_density};
   View view{int(crossings[0]), int(crossings[1]), colour_count, origin.typed_data(), direction.typed_data(),
             t.typed_data(), rgb.typed_data(), range.typed_data(), range_sigma.typed_data(), limit.typed_data(),
@@ -94,7 +94,7 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(FarsideViewTerms, view_terms,
                                   .Arg<F32>().Arg<F32>().Arg<S32>().Arg<S32>().Arg<S32>()
                                   .Ret<F32>().Ret<F32>().Ret<F32>()
                                   .Attr<int32_t>("width").Attr<int32_t>("octaves").Attr<int32_t>("direction_octaves")
-                                  .Attr<int32_t>("radial").Attr<int32_t>("fitted").Attr<int32_t>("waves")
+                                  .Attr<int32_t>("radial").Attr<int32_t>("fitted")
                                   .Attr<float>("density_scale").Attr<float>("mask_error").Attr<float>("outlier")
                                   .Attr<float>("outlier_span").Attr<float>("wall_sigma").Attr<float>("colour_sigma")
                                   .Attr<float>("per_density").Attr<int32_t>("colour_count")

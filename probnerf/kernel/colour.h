@@ -1,11 +1,9 @@
-// The colour network on a tile: inputs are the point's encoding, the ray's direction, and the rest (density, waves).
+// The colour network on a tile: inputs are the point's encoding, the ray's direction, and the logarithm of density.
 #pragma once
 
 #include "field.h"
 
 namespace FARSIDE_NAMESPACE {
-
-constexpr int MOST_DIRECTION = 63;  // encoded, at 10 octaves
 
 // What a ray's direction adds to the first layer, the same for all of its points.
 struct Direction {
@@ -48,18 +46,10 @@ inline void direction_backward(const Sizes& s, const Layers& w, Direction& r, La
 
 inline void colour_forward(const Sizes& s, const Layers& w, const Direction* rays, Tile& t) {
   int n = t.padded;
-  for (int p = 0; p < n; p += LANES) store(t.rest + p, log1p(load(t.sigma + p)));
-  for (int k = 0; k < s.waves; ++k)
-    for (int p = 0; p < n; p += LANES) {
-      Vec phase = {}, sine, cosine;
-      for (int c = 0; c < 3; ++c) phase += w.wave[c * s.waves + k] * load(t.x + c * s.tile + p);
-      sincospi(phase * 0.318309886f, sine, cosine);
-      store(t.rest + (1 + k) * s.tile + p, sine);
-      store(t.rest + (1 + s.waves + k) * s.tile + p, cosine);
-    }
+  for (int p = 0; p < n; p += LANES) store(t.log_sigma + p, log1p(load(t.sigma + p)));
   for (int p = 0; p < n; ++p) memcpy(t.c0 + p * s.H, rays[t.ray[p]].before, sizeof(float) * s.H);
   multiply(n, s.H, s.encoded, t.encoding, 1, s.tile, w.k3, s.H, t.c0, s.H);
-  multiply(n, s.H, s.rest, t.rest, 1, s.tile, w.k3r, s.H, t.c0, s.H);
+  multiply(n, s.H, 1, t.log_sigma, 1, 0, w.k3s, s.H, t.c0, s.H);
   relu(t.c0, n * s.H);
   fill_rows(t.c1, n, s.H, w.b4);
   multiply(n, s.H, s.width, t.c0, s.H, 1, w.k4, s.H, t.c1, s.H);
@@ -98,22 +88,10 @@ inline void colour_backward(const Sizes& s, const Layers& w, const Transposed& w
   multiply(n, s.H, s.width, t.g1, s.H, 1, wt.k4, s.H, t.g0, s.H);
   only_where_positive(t.g0, t.c0, n * s.H);
   multiply(s.encoded, s.H, n, t.encoding, s.tile, 1, t.g0, s.H, g.k3, s.H);
-  multiply(s.rest, s.H, n, t.rest, s.tile, 1, t.g0, s.H, g.k3r, s.H);
+  multiply(1, s.H, n, t.log_sigma, 0, 1, t.g0, s.H, g.k3s, s.H);
   for (int p = 0; p < t.count; ++p) add_rows(rays[t.ray[p]].sum, t.g0 + p * s.H, 1, s.H);
   multiply(n, s.E, s.width, t.g0, s.H, 1, wt.k3, s.E, t.g_encoding, s.E);
-  memset(t.g_rest, 0, sizeof(float) * n * s.R);
-  multiply(n, s.R, s.width, t.g0, s.H, 1, wt.k3r, s.R, t.g_rest, s.R);
-  for (int p = 0; p < t.count; ++p) {
-    const float* gr = t.g_rest + p * s.R;
-    t.g_sigma[p] += gr[0] / (1.0f + t.sigma[p]);
-    for (int k = 0; k < s.waves; ++k) {
-      float phase = gr[1 + k] * t.rest[(1 + s.waves + k) * s.tile + p] - gr[1 + s.waves + k] * t.rest[(1 + k) * s.tile + p];
-      for (int c = 0; c < 3; ++c) {
-        g.wave[c * s.waves + k] += phase * t.x[c * s.tile + p];
-        t.gx[c * s.tile + p] += phase * w.wave[c * s.waves + k];
-      }
-    }
-  }
+  for (int p = 0; p < t.count; ++p) t.g_sigma[p] += dot(t.g0 + p * s.H, w.k3s, s.H) / (1.0f + t.sigma[p]);
 }
 
 }  // namespace FARSIDE_NAMESPACE

@@ -12,21 +12,19 @@ constexpr int CHANNELS = 4;
 constexpr float BASE_Z = -0.75f;
 
 struct Sizes {
-  int width, octaves, direction_octaves, channels, waves;
+  int width, octaves, direction_octaves, channels;
   bool radial, fitted;
   float density_scale;
-  int encoded, encoded_direction, rest;   // inputs of the colour network: encoding, direction, rest
-  int H, E, R;                            // the same in whole vectors
+  int encoded, encoded_direction;  // features of a point and of a direction
+  int H, E;                        // units of a layer and features of a point in whole vectors
   int tile;                               // points worked on together: they and their layers stay in the second cache
   Sizes(const FieldSizes& f, int tile)
       : width(f.width), octaves(f.octaves), direction_octaves(f.direction_octaves), channels(3 + f.radial),
-        waves(f.waves), radial(f.radial), fitted(f.fitted), density_scale(f.density_scale), tile(tile) {
+        radial(f.radial), fitted(f.fitted), density_scale(f.density_scale), tile(tile) {
     encoded = channels * (1 + 2 * octaves);
     encoded_direction = 3 * (1 + 2 * direction_octaves);
-    rest = 1 + 2 * waves;
     H = up(width, LANES);
     E = up(encoded, LANES);
-    R = up(rest, LANES);
   }
 };
 
@@ -46,8 +44,8 @@ struct Arena {
 // One object's weights, or their gradient, with rows of whole vectors.
 struct Layers {
   float *k0, *b0, *k1, *b1, *k2, *b2;                     // density: [encoded][H], [H], [width][H], [H], [H], [1]
-  float *k3, *k3d, *k3r, *b3, *k4, *b4, *k5, *b5;         // colour: inputs in three parts; k5 [3][H]
-  float *stretch, *shift, *wave;                          // [3], [3], [3][waves]
+  float *k3, *k3d, *k3s, *b3, *k4, *b4, *k5, *b5;         // colour: k3's rows for point, direction, density; k5 [3][H]
+  float *stretch, *shift;                                 // [3], [3]
   float* first;
   int64_t count;
   Layers(const Sizes& s, Arena& a) {
@@ -55,9 +53,9 @@ struct Layers {
     int64_t before = a.used;
     int H = s.H;
     k0 = a.take(s.encoded * H), b0 = a.take(H), k1 = a.take(s.width * H), b1 = a.take(H), k2 = a.take(H), b2 = a.take(1);
-    k3 = a.take(s.encoded * H), k3d = a.take(s.encoded_direction * H), k3r = a.take(s.rest * H), b3 = a.take(H);
+    k3 = a.take(s.encoded * H), k3d = a.take(s.encoded_direction * H), k3s = a.take(H), b3 = a.take(H);
     k4 = a.take(s.width * H), b4 = a.take(H), k5 = a.take(3 * H), b5 = a.take(3);
-    stretch = a.take(3), shift = a.take(3), wave = a.take(3 * s.waves + 1);
+    stretch = a.take(3), shift = a.take(3);
     count = a.used - before;
   }
 };
@@ -69,11 +67,10 @@ inline void for_each_part(const Sizes& s, const Layers& l, Visit visit) {
   visit(l.k1, s.width, s.width, s.H, false), visit(l.b1, 1, s.width, s.H, false);
   visit(l.k2, s.width, 1, s.H, true), visit(l.b2, 1, 1, 1, false);
   visit(l.k3, s.encoded, s.width, s.H, false), visit(l.k3d, s.encoded_direction, s.width, s.H, false);
-  visit(l.k3r, s.rest, s.width, s.H, false), visit(l.b3, 1, s.width, s.H, false);
+  visit(l.k3s, 1, s.width, s.H, false), visit(l.b3, 1, s.width, s.H, false);
   visit(l.k4, s.width, s.width, s.H, false), visit(l.b4, 1, s.width, s.H, false);
   visit(l.k5, s.width, 3, s.H, true), visit(l.b5, 1, 3, 3, false);
   if (s.fitted) visit(l.stretch, 1, 3, 3, false), visit(l.shift, 1, 3, 3, false);
-  if (s.waves) visit(l.wave, 3, s.waves, s.waves, false);
 }
 
 inline void unpack_weights(const Sizes& s, const float* flat, Layers& l) {
@@ -92,13 +89,13 @@ inline void pack_weights(const Sizes& s, const Layers& l, float* flat) {
 }
 
 struct Transposed {
-  float *k0, *k1, *k3, *k3r, *k4;  // [width][E], [width][H], [width][E], [width][R], [width][H]
+  float *k0, *k1, *k3, *k4;  // [width][E], [width][H], [width][E], [width][H]
   Transposed(const Sizes& s, Arena& a)
-      : k0(a.take(s.width * s.E)), k1(a.take(s.width * s.H)), k3(a.take(s.width * s.E)), k3r(a.take(s.width * s.R)),
+      : k0(a.take(s.width * s.E)), k1(a.take(s.width * s.H)), k3(a.take(s.width * s.E)),
         k4(a.take(s.width * s.H)) {}
   void set(const Sizes& s, const Layers& l) {
     one(s, l.k0, s.encoded, k0, s.E), one(s, l.k1, s.width, k1, s.H), one(s, l.k3, s.encoded, k3, s.E);
-    one(s, l.k3r, s.rest, k3r, s.R), one(s, l.k4, s.width, k4, s.H);
+    one(s, l.k4, s.width, k4, s.H);
   }
 
  private:
@@ -121,7 +118,7 @@ struct Tile {
   float *window, *slope;               // window, and its derivative by ...
   int* axis;                           // ... this coordinate (3: the height above the plane), or -1
   float *sigma, *g_sigma;              // density with the window
-  float *rest, *g_rest;                // [rest][tile], [tile][R]
+  float* log_sigma;                    // log(1 + sigma), which colour sees
   float *colour[3], *g_colour[3];
   int* ray;                            // which of the tile's rays a point is on
   Tile(const Sizes& s, Arena& a) {
@@ -129,8 +126,7 @@ struct Tile {
     x = a.take(CHANNELS * s.tile), gx = a.take(CHANNELS * s.tile);
     encoding = a.take(s.encoded * s.tile), g_encoding = a.take(s.tile * s.E);
     for (float** h : {&h0, &h1, &c0, &c1, &g0, &g1}) *h = a.take(s.tile * s.H);
-    for (float** h : {&output, &mlp_sigma, &window, &slope, &sigma, &g_sigma}) *h = a.take(s.tile);
-    rest = a.take(s.rest * s.tile), g_rest = a.take(s.tile * s.R);
+    for (float** h : {&output, &mlp_sigma, &window, &slope, &sigma, &g_sigma, &log_sigma}) *h = a.take(s.tile);
     axis = (int*)a.take(s.tile), ray = (int*)a.take(s.tile);
   }
 };

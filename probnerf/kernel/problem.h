@@ -4,7 +4,7 @@
 #include <stdint.h>
 
 struct FieldSizes {  // probnerf.field.MLPField
-  int width, octaves, direction_octaves, radial, fitted, waves;
+  int width, octaves, direction_octaves, radial, fitted;
   float density_scale;
 };
 

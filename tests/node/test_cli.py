@@ -2,7 +2,7 @@
 
 import json
 import re
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -257,9 +257,8 @@ def test_bad_input_gets_one_line(
     }
     places["text"].write_text("no prior, no picture\n")
     places["yaml"].write_text("stges: 3\n")
-    if "{other}" in arguments:  # its arrays are not of the sizes that it states
-        other = ProbNeRF(replace(PRESETS["tiny"], latent=6), jax.random.key(0))
-        save_prior(places["other"], other, {"sizes": asdict(PRESETS["tiny"])})
+    if "{other}" in arguments:  # its arrays are not those of the preset that it names
+        save_prior(places["other"], ProbNeRF(replace(PRESETS["tiny"], latent=6), jax.random.key(0)), {})
     if "{log}" in arguments:
         write_log(places["log"], [frame])
         places["log"].write_bytes(places["log"].read_bytes()[:60])

@@ -54,20 +54,18 @@ class Slow:
             point = turn @ (point - base - [x, y, z]) / np.exp(log_scale) + base
             direction = turn @ direction
         field = self.field
-        k0, b0, k1, b1, k2, b2, k3, b3, k4, b4, k5, b5, *more = self.layers
+        k0, b0, k1, b1, k2, b2, k3, b3, k4, b4, k5, b5, *fitted = self.layers
         place: Any = point
         if field.fitted:
             base = np.array([0, 0, BASE_Z])
-            place = (point - base - more[1]) * np.exp(more[0]) + base
-        phases = place @ more[-1] if field.waves else np.zeros(0)
+            place = (point - base - fitted[1]) * np.exp(fitted[0]) + base
         if field.radial:
             place = [*place, np.sqrt(place[0] ** 2 + place[1] ** 2 + 1e-4)]
         position = _encode(np.asarray(place), field.octaves)
         hidden = np.maximum(np.maximum(position @ k0 + b0, 0) @ k1 + b1, 0)
         u = np.clip(1 - max(np.abs(point).max() - 1, 5 * (BASE_Z - 0.02 - point[2])) / 0.1, 0, 1)
         sigma = field.density_scale * np.logaddexp(0, (hidden @ k2 + b2)[0]) * u**2 * (3 - 2 * u)
-        view = _encode(direction, field.direction_octaves)
-        inputs = np.concatenate([position, view, [np.log1p(sigma)], np.sin(phases), np.cos(phases)])
+        inputs = np.concatenate([position, _encode(direction, field.direction_octaves), [np.log1p(sigma)]])
         hidden = np.maximum(np.maximum(inputs @ k3 + b3, 0) @ k4 + b4, 0)
         return sigma, 1 / (1 + np.exp(-(hidden @ k5 + b5)))
 

@@ -20,7 +20,7 @@ FIELDS = {
     "tiny": PRESETS["tiny"].field,
     "small": PRESETS["small"].field,
     "paper": PRESETS["paper"].field,
-    "odd": MLPField(width=21, octaves=4, direction_octaves=2, radial=True, waves=3),
+    "odd": MLPField(width=21, octaves=4, direction_octaves=2, radial=True),
     "fitted": MLPField(width=80, octaves=1, direction_octaves=0, fitted=True),
 }
 
