@@ -221,8 +221,9 @@ def _with_error(h: Hypotheses) -> Hypotheses:
     """Fill in the standard error of the mean occupancy of unseen voxels above the plane."""
     z = -1.0 + (np.arange(h.grid) + 0.5) * 2.0 / h.grid
     hidden = ~h.seen & (z > BASE_Z)
-    mean = h.solid[:, hidden].mean(axis=1) if hidden.any() else np.zeros(len(h.weights))
-    return replace(h, monte_carlo_error=float(h.estimate(mean)[1]))
+    # one shape at a time: to index them all at once would stop every other thread for a fifth of a second
+    count = np.array([np.count_nonzero(shape & hidden) for shape in h.solid])
+    return replace(h, monte_carlo_error=float(h.estimate(count / max(hidden.sum(), 1))[1]))
 
 
 def _inside_picture(segment: Segment) -> bool:
