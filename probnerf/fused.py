@@ -49,7 +49,16 @@ def view_terms(
     return call(field, likelihood, observation, t, weights, pose)[0]
 
 
-def call(field, likelihood, observation, t, weights, pose, threads: int | None = None, isa: str = ""):
+def call(
+    field: MLPField,
+    likelihood: "Likelihood",
+    observation: Observation,
+    t: Float[Array, "n m"],
+    weights: Float[Array, "p w"],
+    pose: Float[Array, "p 6"],
+    threads: int | None = None,
+    isa: str = "",
+) -> tuple[Float[Array, "p"], Float[Array, "p w"], Float[Array, "p 6"]]:
     """(values, gradients by weights, gradients by pose); `isa` is avx512, avx2 or plain ("": the machine's best)."""
     p = weights.shape[0]
     shapes = [(p,), weights.shape, (p, 6)]
@@ -75,13 +84,14 @@ def call(field, likelihood, observation, t, weights, pose, threads: int | None =
         "per_density": 1.0 / likelihood.lattice.cubes,
     }
     given = (weights, pose, observation.rays.origin, observation.rays.direction, t, *pixels)
-    return operation(
+    values, g_weights, g_pose = operation(
         *(a.astype(jnp.float32) for a in given),
         *flags,
         **{name: np.int32(value) for name, value in sizes.items()},
         **{name: np.float32(value) for name, value in numbers.items()},
         isa=isa,
     )
+    return values, g_weights, g_pose
 
 
 def _forward(field, likelihood, observation, t, weights, pose):

@@ -277,7 +277,9 @@ def _fused(args, positions):
     return likelihood.power * fused.view_terms(model.field, likelihood, observation, t, weights, pose)
 
 
-def plain_log_likelihood(args, positions):
+def plain_log_likelihood(
+    args: tuple[Model, Likelihood, Observation, Float[Array, "n m"]], positions: Float[Array, "p d"]
+) -> Float[Array, "p"]:
     """`log_likelihood` in JAX alone: the kernel's reference, and what runs where there is no kernel."""
 
     def mapped(args, positions):

@@ -187,8 +187,9 @@ def tempered_smc(
 
     `initial` are positions drawn from any density that covers the prior (say a defensive mixture of prior and encoder)
     and the logarithm of that density there; None draws `start_particles` from the prior. `deadline` is on the clock of
-    time.monotonic(): no stage is begun that would pass it even if as short as the shortest so far. `stages` caps their
-    number. Without a deadline the answer depends on key and stages alone. The start is always made.
+    time.monotonic(): no stage is begun that would pass it even if as short as the shortest so far (but for the first,
+    which may compile). `stages` caps their number. Without a deadline the answer depends on key and stages alone. The
+    start is always made.
 
     The samples are the pools of the last `keep` stages. A population's share of the weight is its evidence estimate, so
     that weighted averages stay consistent when populations found different modes; with few particles, whose estimates
@@ -215,7 +216,7 @@ def tempered_smc(
     gradients = float(q0.shape[0] * q0.shape[1])
     kept: list[HMCState] = []  # the pools of the final stages
     cap = config.max_stages if stages is None else min(stages, config.max_stages)
-    done, divergences, shortest, acceptance, result = 0, 0, 0.0, float("nan"), "converged"
+    done, divergences, shortest, acceptance, result = 0, 0, float("inf"), float("nan"), "converged"
 
     def samples(result: str = "underway") -> Posterior:
         chains = kept or [state.chain]
@@ -233,7 +234,8 @@ def tempered_smc(
             if ended:
                 break
             now = time.monotonic()
-            if done >= cap or (deadline is not None and now + shortest > deadline):
+            expected = shortest if done > 1 else 0.0
+            if done >= cap or (deadline is not None and now + expected > deadline):
                 result = "stages" if done >= cap else "budget"
                 break
             final = bool(np.all(np.asarray(state.beta) == 1.0))
@@ -245,7 +247,7 @@ def tempered_smc(
                 kept = [*kept, pool]
             done += 1
             seconds = time.monotonic() - now
-            shortest = seconds if done == 1 else min(shortest, seconds)
+            shortest = shortest if done == 1 else min(shortest, seconds)
             gradients += config.populations * config.particles * config.moves * config.leapfrog_steps
     except KeyboardInterrupt:
         result = "interrupted"

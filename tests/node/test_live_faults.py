@@ -29,8 +29,9 @@ from tests.node.shapes import body_with_handle
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> list[str]:
-    """A command line of `live` that plays the shipped recording with a small untrained prior."""
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """A command line of `live` that plays the shipped recording with a small untrained prior, not warmed up."""
+    monkeypatch.setattr("node.live.warm_up", lambda _: None)
     save_prior(tmp_path / "tiny.safetensors", ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {})
     (tmp_path / "live.yaml").write_text("bus: {listen: [tcp/127.0.0.1:0]}")
     options = ["--prior", str(tmp_path / "tiny.safetensors"), "--config", str(tmp_path / "live.yaml")]

@@ -1,0 +1,56 @@
+"""Warming up compiles with a tracker of its own, and passes a Ctrl-C on."""
+
+import gc
+from dataclasses import replace
+from typing import Any
+
+import jax
+import pytest
+
+from perception.track import Tracker, Update
+from perception.warm import warm_up
+from probnerf.prior import PRESETS, ProbNeRF
+from probnerf.store import Prior
+from tests.node.shapes import body_with_handle
+
+
+def _tracker(monkeypatch: pytest.MonkeyPatch, outcome: str | Exception) -> tuple[Tracker, list[Tracker]]:
+    asked = []
+
+    def update(self: Tracker, frame: Any, segment: Any, **limits: Any) -> Update:
+        asked.append(self)
+        if isinstance(outcome, Exception):
+            raise outcome
+        assert limits["stages"] == 1 and limits["on_answer"](None) is None
+        return Update("new", replace(body_with_handle(), result=outcome), 1, 0.0, 0.0)
+
+    monkeypatch.setattr(Tracker, "update", update)
+    return Tracker(Prior(ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {}, "x"), seed=3), asked
+
+
+def test_another_tracker_of_the_same_settings_looks_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker, asked = _tracker(monkeypatch, "stages")
+    before = gc.get_freeze_count()
+    try:
+        warm_up(tracker)
+        assert gc.get_freeze_count() > before  # what is there is no longer looked through
+    finally:
+        gc.unfreeze()
+    assert len(asked) == 2 and asked[0] is asked[1] is not tracker
+    assert asked[0].prior is tracker.prior and asked[0].seed == 3
+    assert asked[0]._tracks is not tracker._tracks and asked[0]._names is not tracker._names
+
+
+def test_a_ctrl_c_that_the_sampler_took_is_passed_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker, _ = _tracker(monkeypatch, "interrupted")
+    with pytest.raises(KeyboardInterrupt):
+        warm_up(tracker)
+
+
+def test_a_prior_of_other_objects_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker, asked = _tracker(monkeypatch, ValueError("object 1 measures 9 cm and sedans are 4 m"))
+    try:
+        warm_up(tracker)
+    finally:
+        gc.unfreeze()
+    assert len(asked) == 1
