@@ -63,7 +63,12 @@ static ffi::Error view_terms(F32 weights, F32 pose, F32 origin, F32 direction, F
   if (rows.size() != 2 || crossings.size() != 2) return ffi::Error::InvalidArgument("weights and t must be matrices");
   const Code* chosen = code(isa);
   if (!chosen) return ffi::Error::InvalidArgument("this machine has no instruction set " + std::string(isa));
-  int64_t particles = rows[0], size = rows[1];
+  int64_t particles = rows[0], size = rows[1], h = width;
+  if (octaves > 30 || direction_octaves > 30) return ffi::Error::InvalidArgument("at most 30 octaves");
+  int64_t point = (3 + radial) * (1 + 2 * octaves), seen = 3 * (1 + 2 * direction_octaves);
+  int64_t needed = (2 * point + seen + 1 + 2 * h + 4 + 4) * h + 4 + 6 * fitted;  // kernels and biases
+  if (size != needed)
+    return ffi::Error::InvalidArgument("the field has " + std::to_string(needed) + " weights, not " + std::to_string(size));
   FieldSizes field{width, octaves, direction_octaves, radial, fitted, density_scale};
   PixelModel model{mask_error, outlier, outlier_span, wall_sigma, colour_sigma, per_density};
   View view{int(crossings[0]), int(crossings[1]), colour_count, origin.typed_data(), direction.typed_data(),

@@ -15,7 +15,6 @@ struct Direction {
 };
 
 inline void direction_forward(const Sizes& s, const Layers& w, Direction& r) {
-  // three coordinates side by side: one vector holds every octave's argument
   for (int i = 0; i < 3; ++i) {
     r.encoding[i] = r.d[i];
     for (int j = 0; j < s.direction_octaves; ++j) {

@@ -154,7 +154,7 @@ inline float dot(const float* a, const float* b, int count) {
   return sum(t);
 }
 
-// One channel's features: [x, sin 2^j pi x, cos 2^j pi x], `stride` between a channel's consecutive groups.
+// Features [x, sin 2^j pi x, cos 2^j pi x] of every channel, in the order of probnerf.field.encode.
 inline void encode(const Sizes& s, const float* x, int channels, int octaves, float* out, int n) {
   for (int c = 0; c < channels; ++c)
     for (int p = 0; p < n; p += LANES) {

@@ -18,7 +18,7 @@ struct Prepared {
   float* directions;  // [pixels][3]
   TileRange* tiles;
   Crossings crossings;
-  int tile_count = 0, most_pixels = 0;
+  int tile_count = 0;
 
   static int crossed(const View& v, int ray) {
     int n = 0;
@@ -66,7 +66,6 @@ struct Prepared {
           c.peak[point] = (1.0f - m.outlier) * c.inverse_deviation[point] * 0.398942280f;
         }
         tile->pixels += 1, tile->points += n;
-        if (tile->pixels > most_pixels) most_pixels = tile->pixels;
         ++pixel;
       }
     }
@@ -197,7 +196,12 @@ inline void one_particle(const Sizes& s, const PixelModel& m, const Prepared& v,
     points_backward(s, k.weights, t, k.gradient, pose, o.g_pose);
   }
   pack_weights(s, k.gradient, o.g_weights);
-  *o.value = (float)terms.value;
+  float nothing = 0.0f;  // not a number where a weight or the pose is none: a ReLU would hide it
+  for_each_part(s, k.weights, [&](const float* part, int rows, int columns, int stride, bool transposed) {
+    for (int i = 0; i < (transposed ? columns : rows) * stride; ++i) nothing += part[i] * 0.0f;
+  });
+  for (int i = 0; i < 6; ++i) nothing += o.pose[i] * 0.0f;
+  *o.value = (float)terms.value + nothing;
   o.g_pose[3] += terms.log_scale;
   o.g_pose[5] = terms.offset;
 }

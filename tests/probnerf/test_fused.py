@@ -116,6 +116,29 @@ def test_a_view_that_says_nothing_is_zero() -> None:
     assert not any(np.asarray(a).any() for a in found)
 
 
+@pytest.mark.parametrize("what", [np.nan, np.inf])
+def test_what_is_no_number_gives_none(what: float) -> None:
+    field, observation = FIELDS["small"], view(9, 5)
+    likelihood = Likelihood(Lattice(8))
+    t = faces_of_view(observation, likelihood)
+    weights, pose = drawn(field, 3)
+    weights[0, 7], weights[1, -1] = what, what
+    values = np.asarray(fused.call(field, likelihood, observation, t, jnp.asarray(weights), jnp.asarray(pose))[0])
+    assert np.isnan(values[:2]).all() and np.isfinite(values[2])
+    pose[2, 3] = np.nan
+    assert np.isnan(fused.call(field, likelihood, observation, t, jnp.asarray(weights), jnp.asarray(pose))[0]).all()
+
+
+def test_weights_of_another_field_are_refused() -> None:
+    observation, likelihood = view(9, 5), Likelihood(Lattice(8))
+    t = faces_of_view(observation, likelihood)
+    weights, pose = map(jnp.asarray, drawn(FIELDS["tiny"], 2))
+    with pytest.raises(
+        jax.errors.JaxRuntimeError, match=f"has {FIELDS['odd'].size} weights, not {FIELDS['tiny'].size}"
+    ):
+        jax.block_until_ready(fused.call(FIELDS["odd"], likelihood, observation, t, weights, pose))
+
+
 def test_neither_threads_nor_the_instruction_set_change_the_answer() -> None:
     field, observation = FIELDS["small"], view(37, 20)
     likelihood = Likelihood(Lattice(16, 1.1, below=0.15))
