@@ -26,7 +26,7 @@ from probnerf.hmc import StageInfo
 from probnerf.infer import Method
 from probnerf.store import Prior, load_prior
 
-BUDGET_S = 50.0
+BUDGET_S = 60.0
 PICTURE_S = 3.0  # of each object's share of the budget, kept back for its picture
 
 
@@ -37,7 +37,7 @@ class ReplayConfig:
     source: Path | None = None  # frame folder or recording; None: the one that ships with the project
     object: int | None = None  # the one object to infer; None: all
     out: Path | None = None  # None: out/<name of the source>
-    budget: float | None = None  # s for the whole job; None: 50, or no limit where `stages` is given
+    budget: float | None = None  # s for the whole job; None: 60, or no limit where `stages` is given
     stages: int | None = None  # of the sampler, per object
     seed: int = 0
     method: Method | None = None  # None: that of `controller.infer`
