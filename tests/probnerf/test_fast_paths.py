@@ -63,6 +63,7 @@ def test_mapping_with_the_gradient_is_mapping_and_its_gradient(batch_size):
     np.testing.assert_allclose(alone, jax.jit(plain)(positions, jnp.zeros(8)), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_particles_shared_out_over_devices_have_the_same_likelihood():
     """Four particles on two CPU devices (of a process of its own) against one device."""
     code = """

@@ -45,6 +45,7 @@ def _first() -> tuple[Args, Posterior]:
     return args, tempered_smc(jax.random.key(0), log_likelihood, args, 9, CONFIG)
 
 
+@pytest.mark.slow
 def test_views_that_are_joined_multiply_their_likelihoods() -> None:
     first, second = scene("hidden", True), scene("hidden", True, azimuth=110.0, seed=1)
     q = jax.random.normal(jax.random.key(1), (5, 9))
@@ -64,6 +65,7 @@ def test_a_second_view_that_shows_the_handle_collapses_the_yaw_to_the_truth() ->
     assert _spread(after) < 0.4 * _spread(before)
 
 
+@pytest.mark.slow
 def test_the_same_view_again_asked_of_its_own_posterior_changes_nothing_and_takes_no_tempering() -> None:
     args, before = _first()
     after = tempered_smc(jax.random.key(2), log_likelihood, args, 9, CONFIG, initial=start_from(before))
