@@ -1,12 +1,13 @@
-"""The pixel likelihood of an `MLPField` and its gradient as one fused CPU operation (`probnerf/kernel`), from JAX.
+"""An `MLPField`'s pixel likelihood with its gradient, and its density, as fused CPU operations (`probnerf/kernel`).
 
-The same function as `probnerf.model.pixel_terms` summed over pixels, without anything of size points x width stored.
+The same functions as `probnerf.model.pixel_terms` summed over pixels and `probnerf.model.density_at`, without anything
+of size points x width stored.
 """
 
 import ctypes
 import os
 from functools import cache, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from probnerf.types import Observation
 if TYPE_CHECKING:
     from probnerf.model import Likelihood
 
-TARGET = "farside_view_terms"
+VIEW_TERMS, DENSITY = "farside_view_terms", "farside_density"
 
 
 @cache
@@ -29,7 +30,8 @@ def available() -> bool:
     if os.environ.get("FARSIDE_KERNEL") == "0" or not LIBRARY.is_file() or jax.default_backend() != "cpu":
         return False
     library = ctypes.CDLL(str(LIBRARY))
-    jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(library.FarsideViewTerms), platform="cpu")
+    for target, function in ((VIEW_TERMS, library.FarsideViewTerms), (DENSITY, library.FarsideDensity)):
+        jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(function), platform="cpu")
     return True
 
 
@@ -41,12 +43,14 @@ def view_terms(
     t: Float[Array, "n m"],
     weights: Float[Array, "p w"],
     pose: Float[Array, "p 6"],
+    pixel_weight: Float[Array, "n"] | None = None,
 ) -> Float[Array, "p"]:
-    """log p(pixels | weights_p, pose_p) for each particle, differentiable in `weights` and `pose`.
+    """Sum of w_i log p(pixel i | weights_p, pose_p) for each particle, differentiable in `weights` and `pose`.
 
-    `pose` is yaw, x, y, log-scale, z and the ranges' common offset. The likelihood's `power` is not applied.
+    `pose` is yaw, x, y, log-scale, z and the ranges' common offset; w is `pixel_weight`, or 1. The likelihood's `power`
+    is not applied. Without differentiation it is a forward pass alone.
     """
-    return call(field, likelihood, observation, t, weights, pose)[0]
+    return call(field, likelihood, observation, t, weights, pose, pixel_weight, gradients=False)[0]
 
 
 def call(
@@ -56,26 +60,23 @@ def call(
     t: Float[Array, "n m"],
     weights: Float[Array, "p w"],
     pose: Float[Array, "p 6"],
+    pixel_weight: Float[Array, "n"] | None = None,
     threads: int | None = None,
     isa: str = "",
+    gradients: bool = True,
 ) -> tuple[Float[Array, "p"], Float[Array, "p w"], Float[Array, "p 6"]]:
-    """(values, gradients by weights, gradients by pose); `isa` is avx512, avx2 or plain ("": the machine's best)."""
-    p = weights.shape[0]
-    shapes = [(p,), weights.shape, (p, 6)]
-    operation = jax.ffi.ffi_call(TARGET, [jax.ShapeDtypeStruct(s, jnp.float32) for s in shapes])
+    """(values, gradients by weights, gradients by pose); `isa` is avx512, avx2 or plain ("": the machine's best).
+
+    Without `gradients` theirs are empty, [0, w] and [0, 6]. The number of threads changes rounding where there are
+    fewer particles, which they then share; else nothing.
+    """
+    p, w = weights.shape
+    shapes = [(p,), (gradients * p, w), (gradients * p, 6)]
+    operation = jax.ffi.ffi_call(VIEW_TERMS, [jax.ShapeDtypeStruct(s, jnp.float32) for s in shapes])
     flags = [a.astype(jnp.int32) for a in (observation.status, observation.rgb_valid, observation.range_valid)]
-    pixels = (observation.rgb, observation.range, observation.range_sigma, observation.limit)
-    sizes = {
-        "width": field.width,
-        "octaves": field.octaves,
-        "direction_octaves": field.direction_octaves,
-        "radial": field.radial,
-        "fitted": field.fitted,
-        "colour_count": observation.colour_count,
-        "threads": threads or os.cpu_count() or 1,
-    }
+    weight = jnp.ones(t.shape[0]) if pixel_weight is None else pixel_weight
+    pixels = (observation.rgb, observation.range, observation.range_sigma, observation.limit, weight)
     numbers = {
-        "density_scale": field.density_scale,
         "mask_error": likelihood.mask_error,
         "outlier": likelihood.outlier,
         "outlier_span": likelihood.outlier_span,
@@ -87,21 +88,48 @@ def call(
     values, g_weights, g_pose = operation(
         *(a.astype(jnp.float32) for a in given),
         *flags,
-        **{name: np.int32(value) for name, value in sizes.items()},
         **{name: np.float32(value) for name, value in numbers.items()},
-        isa=isa,
+        colour_count=np.int32(observation.colour_count),
+        **_how(field, threads, isa),
     )
     return values, g_weights, g_pose
 
 
-def _forward(field, likelihood, observation, t, weights, pose):
-    values, g_weights, g_pose = call(field, likelihood, observation, t, weights, pose)
+def _how(field: MLPField, threads: int | None, isa: str) -> dict[str, Any]:
+    names = ("width", "octaves", "direction_octaves", "radial", "fitted")
+    sizes = {name: np.int32(getattr(field, name)) for name in names}
+    return {
+        "field": {**sizes, "density_scale": np.float32(field.density_scale)},
+        "threads": np.int32(threads or os.cpu_count() or 1),
+        "isa": isa,
+    }
+
+
+def density(
+    field: MLPField,
+    weights: Float[Array, "p w"],
+    pose: Float[Array, "p 6"],
+    points: Float[Array, "n 3"],
+    threads: int | None = None,
+    isa: str = "",
+) -> Float[Array, "p n"]:
+    """Window x density of each particle at points of the view frame; not differentiable. See `call` for `pose`, `isa`.
+
+    What is outside the window costs nothing. The answer does not depend on the number of threads.
+    """
+    found = jax.ShapeDtypeStruct((weights.shape[0], points.shape[0]), jnp.float32)
+    given = (a.astype(jnp.float32) for a in (weights, pose, points))
+    return jax.ffi.ffi_call(DENSITY, found)(*given, **_how(field, threads, isa))
+
+
+def _forward(field, likelihood, observation, t, weights, pose, pixel_weight):
+    values, g_weights, g_pose = call(field, likelihood, observation, t, weights, pose, pixel_weight)
     return values, (g_weights, g_pose)
 
 
 def _backward(field, gradients, cotangent):
     g_weights, g_pose = gradients
-    return None, None, None, g_weights * cotangent[:, None], g_pose * cotangent[:, None]
+    return None, None, None, g_weights * cotangent[:, None], g_pose * cotangent[:, None], None
 
 
 view_terms.defvjp(_forward, _backward)

@@ -95,9 +95,14 @@ def _centre_z(grid: int) -> Float[np.ndarray, "G"]:
 
 def _fill(walls: Bool[np.ndarray, "G G G"]) -> Bool[np.ndarray, "G G G"]:
     """Dilate walls by one voxel, fill what empty space cannot reach from outside, erode by one."""
-    grown = _dilate(np.pad(walls, 2))  # room to dilate, and around it the outside that empty space is reached from
-    empty, _ = ndimage.label(~grown, structure=_SIX_CONNECTED)
-    return _erode(empty != empty[0, 0, 0])[2:-2, 2:-2, 2:-2]
+    filled = np.zeros_like(walls)
+    box = ndimage.find_objects(walls.view(np.uint8))  # of all walls: the rest is outside
+    if box:
+        # room to dilate, and around it the outside that empty space is reached from
+        grown = _dilate(np.pad(walls[box[0]], 2))
+        empty, _ = ndimage.label(~grown, structure=_SIX_CONNECTED)
+        filled[box[0]] = _erode(empty != empty[0, 0, 0])[2:-2, 2:-2, 2:-2]
+    return filled
 
 
 def _dilate(mask: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:

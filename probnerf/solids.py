@@ -51,6 +51,7 @@ def draw_solids(seeds: np.ndarray, progress: Callable[[int, int], None] | None =
 @jax.jit
 def _surface(objects: TabletopObject, seeds: Array) -> Solids:
     def one(obj: TabletopObject, seed: Array) -> Solids:
+        """One object's samples."""
         k0, k1 = jax.random.split(jax.random.key(seed))
         base = jnp.array([0.0, 0.0, BASE_Z])
         shift = base + jnp.append(obj.shift, 0.0)

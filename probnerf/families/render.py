@@ -47,6 +47,7 @@ def _vessel_hit(
     oo, od, dd = ox * ox + oy * oy, ox * dx + oy * dy, dx * dx + dy * dy
 
     def edge(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        """The nearest hit so far and its normal's height, with what edge i adds."""
         best, normal_z = state
         (ra, za), (rb, zb) = outline[i], outline[i + 1]
         rise = zb - za

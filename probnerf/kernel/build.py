@@ -33,12 +33,17 @@ def build() -> bool:
         return False
     common = [cxx, "-std=c++17", "-O3", "-fPIC", "-fno-math-errno", "-isystem", jax.ffi.include_dir()]
     sets = PLAIN | (X86 if platform.machine() in ("x86_64", "AMD64") else {})
-    objects = [LIBRARY.with_suffix(f".{name}.o") for name in (*sets, "binding")]
-    runs = []
-    for (name, (lanes, tile, options)), made in zip(sets.items(), objects, strict=False):
+    runs, objects = [], []
+
+    def compile_(source: str, name: str, options: list[str]) -> None:
+        objects.append(LIBRARY.with_suffix(f".{name}.{source}.o"))
+        runs.append([*common, *options, "-c", str(FOLDER / f"{source}.cc"), "-o", str(objects[-1])])
+
+    for name, (lanes, tile, options) in sets.items():
         sizes = [f"-DFARSIDE_ISA={name}", f"-DFARSIDE_LANES={lanes}", f"-DFARSIDE_TILE={tile}"]
-        runs.append([*common, *options, *sizes, "-c", str(FOLDER / "view.cc"), "-o", str(made)])
-    runs.append([*common, "-c", str(FOLDER / "binding.cc"), "-o", str(objects[-1])])
+        for source in ("view", "points"):
+            compile_(source, name, [*options, *sizes])
+    compile_("binding", "all", [])
     started = [subprocess.Popen(run) for run in runs]
     failed = any([process.wait() for process in started])
     made = LIBRARY.with_suffix(".tmp")
@@ -46,6 +51,7 @@ def build() -> bool:
     for path in objects:
         path.unlink(missing_ok=True)
     if failed:
+        LIBRARY.unlink(missing_ok=True)  # an older one may not fit the Python beside it
         print(f"{cxx} could not build the kernel: Farside runs on JAX alone, several times slower", file=sys.stderr)
         return False
     os.replace(made, LIBRARY)

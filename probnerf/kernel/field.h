@@ -116,7 +116,7 @@ struct Tile {
   float *h0, *h1, *c0, *c1, *g0, *g1;  // [tile][H]
   float *output, *mlp_sigma;           // density network's output and its density, before the window
   float *window, *slope;               // window, and its derivative by ...
-  int* axis;                           // ... this coordinate (3: the height above the plane), or -1
+  int* axis;                           // ... this coordinate
   float *sigma, *g_sigma;              // density with the window
   float* log_sigma;                    // log(1 + sigma), which colour sees
   float *colour[3], *g_colour[3];
@@ -130,6 +130,31 @@ struct Tile {
     axis = (int*)a.take(s.tile), ray = (int*)a.take(s.tile);
   }
 };
+
+// Point p of a tile whose density is known, as point `to` of another.
+inline void copy_point(const Sizes& s, const Tile& from, int p, Tile& t, int to) {
+  for (int i = 0; i < 3; ++i) t.q[i][to] = from.q[i][p];
+  for (int c = 0; c < s.channels; ++c) t.x[c * s.tile + to] = from.x[c * s.tile + p];
+  for (int f = 0; f < s.encoded; ++f) t.encoding[f * s.tile + to] = from.encoding[f * s.tile + p];
+  memcpy(t.h0 + to * s.H, from.h0 + p * s.H, sizeof(float) * s.H);
+  memcpy(t.h1 + to * s.H, from.h1 + p * s.H, sizeof(float) * s.H);
+  t.output[to] = from.output[p], t.mlp_sigma[to] = from.mlp_sigma[p], t.sigma[to] = from.sigma[p];
+  t.window[to] = from.window[p], t.slope[to] = from.slope[p], t.axis[to] = from.axis[p];
+}
+
+// Points that fill the last vector and count for nothing.
+inline void pad(const Sizes& s, Tile& t) {
+  t.padded = up(t.count, LANES);
+  for (int p = t.count; p < t.padded; ++p) {
+    for (int i = 0; i < 3; ++i) t.q[i][p] = t.g_colour[i][p] = 0.0f;
+    for (int c = 0; c < s.channels; ++c) t.x[c * s.tile + p] = 1.0f;
+    for (int f = 0; f < s.encoded; ++f) t.encoding[f * s.tile + p] = 0.0f;
+    memset(t.h0 + p * s.H, 0, sizeof(float) * s.H);
+    memset(t.h1 + p * s.H, 0, sizeof(float) * s.H);
+    t.output[p] = t.mlp_sigma[p] = t.sigma[p] = t.window[p] = t.slope[p] = t.g_sigma[p] = 0.0f;
+    t.ray[p] = 0;
+  }
+}
 
 inline void fill_rows(float* c, int rows, int columns, const float* row) {
   for (int r = 0; r < rows; ++r)

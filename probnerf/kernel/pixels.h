@@ -13,7 +13,7 @@ namespace FARSIDE_NAMESPACE {
 struct Pixel {
   int first, count;  // its crossings among the view's
   bool object, coloured;
-  float rgb[3], uniform, limit;
+  float rgb[3], uniform, limit, weight;
 };
 
 // The view's crossings, all rays' one after another, each array [points].
@@ -24,11 +24,18 @@ struct Crossings {
   float *inverse_deviation, *peak, *floor;  // density of a range given this face: peak exp(-r^2/2) + floor
 };
 
-struct PixelScratch {
-  float *tau, *alpha, *left, *density, *slope;  // [tile]; left: exp(-tau); density of the range, its slope by the offset
-  explicit PixelScratch(const Sizes& s, Arena& a) {
-    for (float** p : {&tau, &alpha, &left, &density, &slope}) *p = a.take(s.tile);
+// Of every crossing of the view, for one particle, each array [points].
+struct Composite {
+  float *tau, *weight, *left;  // compositing weight; transmittance after the face
+  float *density, *slope;      // density of the range, its slope by the offset
+  Composite(int points, Arena& a) {
+    for (float** p : {&tau, &weight, &left, &density, &slope}) *p = a.take(points);
   }
+};
+
+// Of every pixel, for one particle.
+struct PixelSums {
+  float hit, opacity, left, likelihood;
 };
 
 struct PixelGradient {
@@ -36,74 +43,81 @@ struct PixelGradient {
   float log_scale = 0.0f, offset = 0.0f;
 };
 
-inline void pixel_terms(const Sizes& s, const PixelModel& m, const Crossings& view, const Pixel* pixels, int count,
-                        float scale, float offset, Tile& t, PixelScratch& k, PixelGradient& g) {
-  if (count == 0) return;
-  int n = t.padded, base = pixels[0].first;
-  float per_density = m.per_density * scale;
-  for (int p = 0; p < n; p += LANES) {
+// A crossing whose compositing weight is less (of a free ray: whose optical depth, times what the pixel says against it) is
+// passed over: its colour, and its gradients, are so small against the others'. Sharp walls leave one crossing of ten.
+constexpr float NEGLIGIBLE = 1e-8f;
+
+// From a tile's densities, which its first pixel's first crossing begins, to all that needs no colour.
+inline void composite(const PixelModel& m, const Crossings& view, const Pixel* pixels, int count, float per_density,
+                      float offset, const Tile& t, Composite& c, PixelSums* sums) {
+  int first = pixels[0].first;
+  for (int p = 0; p < t.padded; p += LANES) {
     Vec tau = load(t.sigma + p) * per_density;
     Exp e = exp_both(-tau);
-    store(k.tau + p, tau), store(k.left + p, e.value), store(k.alpha + p, -e.minus_one);
-    Vec inverse = load(view.inverse_deviation + base + p);
-    Vec r = (load(view.measured + base + p) - offset) * inverse;
-    Vec surface = load(view.peak + base + p) * exp(-0.5f * r * r);
-    store(k.density + p, surface + load(view.floor + base + p));
-    store(k.slope + p, surface * r * inverse);
-    store(t.g_sigma + p, Vec{});
-    for (int i = 0; i < 3; ++i) store(t.g_colour[i] + p, Vec{});
+    store(c.tau + first + p, tau), store(c.left + first + p, e.value), store(c.weight + first + p, -e.minus_one);
+    Vec inverse = load(view.inverse_deviation + first + p);
+    Vec r = (load(view.measured + first + p) - offset) * inverse;
+    Vec surface = load(view.peak + first + p) * exp(-0.5f * r * r);
+    store(c.density + first + p, surface + load(view.floor + first + p));
+    store(c.slope + first + p, surface * r * inverse);
   }
-  float* g_tau = t.g_sigma;
   for (int j = 0; j < count; ++j) {
     const Pixel& ray = pixels[j];
-    int begin = ray.first - base, end = begin + ray.count;
+    int begin = ray.first, end = begin + ray.count;
     if (!ray.object) {
       float total = 0.0f;
       for (int p = begin; p < end; ++p)
-        if (view.t[base + p] <= ray.limit) total += k.tau[p];
+        if (view.t[p] <= ray.limit) total += c.tau[p];
       float clear = (1.0f - 2.0f * m.mask_error) * expf(-total);
       float likelihood = m.mask_error + clear;
-      g.value += logf(likelihood);
-      for (int p = begin; p < end; ++p)
-        if (view.t[base + p] <= ray.limit) g_tau[p] = -clear / likelihood;
+      for (int p = begin; p < end; ++p) c.weight[p] = view.t[p] <= ray.limit ? c.tau[p] * clear / likelihood : 0.0f;
+      sums[j] = {0.0f, 0.0f, clear, likelihood};
       continue;
     }
-    float left = 1.0f, hit = 0.0f, opacity = 0.0f, sums[3] = {0.0f, 0.0f, 0.0f};
+    float left = 1.0f, hit = 0.0f, opacity = 0.0f;
     for (int p = begin; p < end; ++p) {
-      float w = left * k.alpha[p];
-      left *= k.left[p];
-      k.alpha[p] = w, k.left[p] = left;  // from here on: the compositing weight, the transmittance after the face
-      hit += w * k.density[p];
+      float w = left * c.weight[p];
+      left *= c.left[p];
+      c.weight[p] = w, c.left[p] = left;
+      hit += w * c.density[p];
       opacity += w;
-      if (ray.coloured)
-        for (int i = 0; i < 3; ++i) sums[i] += w * t.colour[i][p];
     }
-    float likelihood = (1.0f - m.mask_error) * hit + m.mask_error * left * ray.uniform;
-    g.value += logf(likelihood);
-    float g_hit = (1.0f - m.mask_error) / likelihood, share = 1.0f / (opacity + 1e-3f), mean[3], g_mean[3] = {};
-    for (int i = 0; ray.coloured && i < 3; ++i) {
-      mean[i] = (sums[i] + 0.5e-3f) * share;
-      float z = (ray.rgb[i] - mean[i]) / m.colour_sigma;
-      g.value += -0.5f * z * z - logf(m.colour_sigma) - 0.918938533f;
-      g_mean[i] = z / m.colour_sigma * share;
-    }
-    float behind = m.mask_error * ray.uniform / likelihood * left;  // sum of g_w w behind, and the miss
-    for (int p = end - 1; p >= begin; --p) {
-      float w = k.alpha[p], g_w = g_hit * k.density[p];
-      if (ray.coloured)
-        for (int i = 0; i < 3; ++i) {
-          g_w += g_mean[i] * (t.colour[i][p] - mean[i]);
-          t.g_colour[i][p] = g_mean[i] * w;
-        }
-      g.offset += g_hit * w * k.slope[p];
-      g_tau[p] = g_w * k.left[p] - behind;
-      behind += g_w * w;
-    }
+    sums[j] = {hit, opacity, left, (1.0f - m.mask_error) * hit + m.mask_error * left * ray.uniform};
   }
-  for (int p = 0; p < n; p += LANES) {
-    Vec gt = load(g_tau + p);
-    g.log_scale += sum(gt * load(k.tau + p));
-    store(t.g_sigma + p, gt * per_density);
+}
+
+// A pixel's term, and its gradient by the density and the colour of its crossings that count: those of `t` from `begin` to
+// `end`, which stand at `source` among the view's.
+inline void pixel_term(const PixelModel& m, const Pixel& ray, const PixelSums& of, const Composite& c, const int* source,
+                       int begin, int end, Tile& t, PixelGradient& g) {
+  g.value += ray.weight * logf(of.likelihood);
+  if (!ray.object) {
+    for (int p = begin; p < end; ++p) {
+      t.g_sigma[p] = -ray.weight * of.left / of.likelihood;
+      g.log_scale += t.g_sigma[p] * c.tau[source[p]];
+    }
+    return;
+  }
+  float g_hit = ray.weight * (1.0f - m.mask_error) / of.likelihood, share = 1.0f / (of.opacity + 1e-3f), mean[3], g_mean[3] = {};
+  for (int i = 0; ray.coloured && i < 3; ++i) {
+    float sum = 0.0f;
+    for (int p = begin; p < end; ++p) sum += c.weight[source[p]] * t.colour[i][p];
+    mean[i] = (sum + 0.5e-3f) * share;
+    float z = (ray.rgb[i] - mean[i]) / m.colour_sigma;
+    g.value += ray.weight * (-0.5f * z * z - logf(m.colour_sigma) - 0.918938533f);
+    g_mean[i] = ray.weight * z / m.colour_sigma * share;
+  }
+  float behind = ray.weight * m.mask_error * ray.uniform / of.likelihood * of.left;  // sum of g_w w behind, and the miss
+  for (int p = end - 1; p >= begin; --p) {
+    float w = c.weight[source[p]], g_w = g_hit * c.density[source[p]];
+    for (int i = 0; ray.coloured && i < 3; ++i) {
+      g_w += g_mean[i] * (t.colour[i][p] - mean[i]);
+      t.g_colour[i][p] = g_mean[i] * w;
+    }
+    g.offset += g_hit * w * c.slope[source[p]];
+    t.g_sigma[p] = g_w * c.left[source[p]] - behind;
+    g.log_scale += t.g_sigma[p] * c.tau[source[p]];
+    behind += g_w * w;
   }
 }
 

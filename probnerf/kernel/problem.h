@@ -3,6 +3,8 @@
 
 #include <stdint.h>
 
+constexpr int MOST_OCTAVES = 20;  // of more, single precision has no digits left
+
 struct FieldSizes {  // probnerf.field.MLPField
   int width, octaves, direction_octaves, radial, fitted;
   float density_scale;
@@ -15,11 +17,22 @@ struct PixelModel {  // probnerf.model.Likelihood
 struct View {  // constants of an observation
   int rays, crossings, colour_count;
   const float *origin, *direction, *t;                       // [rays][3], [rays][3], [rays][crossings]
-  const float *rgb, *range, *range_sigma, *limit;            // [rays][3], [rays], ...
+  const float *rgb, *range, *range_sigma, *limit, *weight;   // [rays][3], [rays], ...; of a ray's log-likelihood
   const int32_t *status, *rgb_valid, *range_valid;           // [rays]
 };
 
 struct Particle {
   const float *weights, *pose;        // [size], [6]: yaw, x, y, log-scale, z, range offset
-  float *value, *g_weights, *g_pose;  // [1], [size], [6]
+  float *value, *g_weights, *g_pose;  // [1], [size], [6]; without g_pose only the value is asked for
+  int part, parts;                    // only every so many of the view's tiles, from this one on
+};
+
+struct Points {  // of the view's frame
+  int64_t count;
+  const float* at;  // [count][3]
+};
+
+struct Shape {
+  const float *weights, *pose;  // [size], [6] as above
+  float* density;               // [count] of the points, with the window
 };

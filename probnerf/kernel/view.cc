@@ -2,6 +2,7 @@
 // and at once backwards, so that nothing of size points x width is ever stored. Compiled once per instruction set.
 #include "colour.h"
 #include "pixels.h"
+#include "place.h"
 
 namespace FARSIDE_NAMESPACE {
 
@@ -18,7 +19,7 @@ struct Prepared {
   float* directions;  // [pixels][3]
   TileRange* tiles;
   Crossings crossings;
-  int tile_count = 0;
+  int tile_count = 0, points = 0;
 
   static int crossed(const View& v, int ray) {
     int n = 0;
@@ -27,17 +28,16 @@ struct Prepared {
   }
 
   Prepared(const View& v, const PixelModel& m, const Sizes& s, Arena& a) {
-    int total = 0;
-    for (int i = 0; i < v.rays; ++i) total += crossed(v, i);
+    for (int i = 0; i < v.rays; ++i) points += crossed(v, i);
     pixels = (Pixel*)a.take((v.rays + 1) * (int64_t)sizeof(Pixel) / 4 + 1);
     directions = a.take(3 * (v.rays + 1));
     tiles = (TileRange*)a.take((v.rays + 1) * (int64_t)sizeof(TileRange) / 4 + 1);
     Crossings& c = crossings;
     for (float** p : {&c.at[0], &c.at[1], &c.at[2], &c.t, &c.measured, &c.inverse_deviation, &c.peak, &c.floor})
-      *p = a.take(total + s.tile);
+      *p = a.take(points + s.tile);
     if (!a.next) return;
     for (float* p : {c.at[0], c.at[1], c.at[2], c.t, c.measured, c.inverse_deviation, c.peak, c.floor})
-      memset(p, 0, sizeof(float) * (total + s.tile));
+      memset(p, 0, sizeof(float) * (points + s.tile));
     int pixel = 0, point = 0;
     for (bool coloured : {true, false}) {
       TileRange* tile = nullptr;
@@ -50,7 +50,7 @@ struct Prepared {
           *tile = {pixel, 0, 0};
         }
         bool ranged = object && v.range_valid[i];
-        pixels[pixel] = {point, n, object, coloured, {}, ranged ? 1.0f / m.outlier_span : 1.0f, v.limit[i]};
+        pixels[pixel] = {point, n, object, coloured, {}, ranged ? 1.0f / m.outlier_span : 1.0f, v.limit[i], v.weight[i]};
         for (int j = 0; j < 3; ++j) pixels[pixel].rgb[j] = v.rgb[3 * i + j], directions[3 * pixel + j] = v.direction[3 * i + j];
         const float* t = v.t + i * v.crossings;
         for (int k = 0; k < n; ++k, ++point) {
@@ -72,14 +72,15 @@ struct Prepared {
   }
 };
 
-struct Scratch {
-  Layers weights, gradient;
-  Transposed transposed;
+// Crossings that count, of so many pixels one after another: what is left of a tile, or of several.
+struct Few {
   Tile tile;
-  PixelScratch pixels;
-  Direction* directions;
-  Scratch(const Sizes& s, int most_pixels, Arena& a)
-      : weights(s, a), gradient(s, a), transposed(s, a), tile(s, a), pixels(s, a) {
+  int* source;            // [tile] which of the view's crossings each is
+  int* ends;              // [rays] of each pixel: where its crossings end
+  Direction* directions;  // [rays] of each coloured pixel
+  int first_pixel = 0, pixels = 0;
+  Few(const Sizes& s, int most_pixels, Arena& a) : tile(s, a), source((int*)a.take(s.tile)), ends((int*)a.take(most_pixels)) {
+    tile.count = 0;
     directions = (Direction*)a.take(most_pixels * (int64_t)sizeof(Direction) / 4 + 1);
     for (int i = 0; i < most_pixels; ++i) {
       Direction d = Direction::take(s, a);
@@ -88,27 +89,16 @@ struct Scratch {
   }
 };
 
-// The window of probnerf.foam.window at the tile's points, and its derivative by one coordinate.
-inline void window(Tile& t) {
-  const float margin = 0.1f;
-  for (int p = 0; p < t.padded; ++p) {
-    int axis = 0;
-    for (int i = 1; i < 3; ++i)
-      if (fabsf(t.q[i][p]) > fabsf(t.q[axis][p])) axis = i;
-    float beyond = fabsf(t.q[axis][p]) - 1.0f, below = 5.0f * (BASE_Z - 0.02f - t.q[2][p]);
-    float u = 1.0f - (beyond > below ? beyond : below) / margin;
-    float slope = beyond > below ? (t.q[axis][p] > 0.0f ? -1.0f : 1.0f) : 5.0f;
-    t.axis[p] = beyond > below ? axis : 2;
-    t.slope[p] = u > 0.0f && u < 1.0f ? 6.0f * u * (1.0f - u) * slope / margin : 0.0f;
-    u = u < 0.0f ? 0.0f : u > 1.0f ? 1.0f : u;
-    t.window[p] = u * u * (3.0f - 2.0f * u);
-  }
-}
-
-struct PoseMatrix {
-  float c, s, inverse, x, y, z;
-  explicit PoseMatrix(const float* pose)
-      : c(cosf(pose[0])), s(sinf(pose[0])), inverse(expf(-pose[3])), x(pose[1]), y(pose[2]), z(BASE_Z + pose[4]) {}
+struct Scratch {
+  Layers weights, gradient;
+  Transposed transposed;
+  Tile tile;
+  Composite composite;
+  PixelSums* sums;  // [rays]
+  Few few;
+  Scratch(const Sizes& s, int most_pixels, int points, Arena& a)
+      : weights(s, a), gradient(s, a), transposed(s, a), tile(s, a), composite(points + s.tile, a),
+        sums((PixelSums*)a.take(most_pixels * (int64_t)sizeof(PixelSums) / 4 + 1)), few(s, most_pixels, a) {}
 };
 
 // The gradient by t.gx (and by the window, from t.g_sigma) brought back to fit and pose.
@@ -146,62 +136,105 @@ inline void points_backward(const Sizes& s, const Layers& w, Tile& t, Layers& g,
   g_pose[4] -= pose.inverse * sums[2];
 }
 
-inline void one_particle(const Sizes& s, const PixelModel& m, const Prepared& v, Scratch& k, const Particle& o) {
-  unpack_weights(s, o.weights, k.weights);
-  k.transposed.set(s, k.weights);
-  memset(k.gradient.first, 0, sizeof(float) * k.gradient.count);
-  for (int i = 0; i < 6; ++i) o.g_pose[i] = 0.0f;
-  PoseMatrix pose(o.pose);
-  PixelGradient terms;
-  Tile& t = k.tile;
-  for (int j = 0; j < v.tile_count; ++j) {
-    const TileRange& range = v.tiles[j];
-    const Pixel* pixels = v.pixels + range.first_pixel;
-    int first = pixels[0].first, n = up(range.points, LANES);
-    t.count = range.points, t.padded = n;
-    for (int p = 0; p < n; p += LANES) {
-      Vec x = load(v.crossings.at[0] + first + p) - pose.x, y = load(v.crossings.at[1] + first + p) - pose.y;
-      Vec z = load(v.crossings.at[2] + first + p) - pose.z;
-      store(t.q[0] + p, pose.inverse * (pose.c * x + pose.s * y));
-      store(t.q[1] + p, pose.inverse * (pose.c * y - pose.s * x));
-      store(t.q[2] + p, pose.inverse * z + BASE_Z);
-    }
-    window(t);
-    density_forward(s, k.weights, t);
-    bool coloured = pixels[0].coloured;
-    if (coloured) {
-      for (int p = 0; p < n; ++p) t.ray[p] = 0;
-      for (int r = 0; r < range.pixels; ++r) {
-        const float* d = v.directions + 3 * (range.first_pixel + r);
-        Direction& to = k.directions[r];
-        to.d[0] = pose.c * d[0] + pose.s * d[1], to.d[1] = pose.c * d[1] - pose.s * d[0], to.d[2] = d[2];
-        direction_forward(s, k.weights, to);
-        for (int p = 0; p < pixels[r].count; ++p) t.ray[pixels[r].first - first + p] = r;
-      }
-      colour_forward(s, k.weights, k.directions, t);
-    }
-    pixel_terms(s, m, v.crossings, pixels, range.pixels, 1.0f / pose.inverse, o.pose[5], t, k.pixels, terms);
-    memset(t.g_encoding, 0, sizeof(float) * n * s.E);
+// The terms of the pixels whose crossings stand in k.few, and their gradient; then it is empty.
+inline void finish(const Sizes& s, const PixelModel& m, const Prepared& v, Scratch& k, const PoseMatrix& pose,
+                   const Particle& o, PixelGradient& terms) {
+  Few& few = k.few;
+  Tile& t = few.tile;
+  if (few.pixels == 0) return;
+  const Pixel* pixels = v.pixels + few.first_pixel;
+  bool coloured = pixels[0].coloured;
+  pad(s, t);
+  if (coloured) colour_forward(s, k.weights, few.directions, t);
+  for (int r = 0; r < few.pixels; ++r)
+    pixel_term(m, pixels[r], k.sums[few.first_pixel + r], k.composite, few.source, r ? few.ends[r - 1] : 0, few.ends[r],
+               t, terms);
+  if (o.g_pose && t.count > 0) {
+    float per_density = m.per_density / pose.inverse;
+    for (int p = 0; p < t.padded; p += LANES) store(t.g_sigma + p, load(t.g_sigma + p) * per_density);
+    memset(t.g_encoding, 0, sizeof(float) * t.padded * s.E);
     memset(t.gx, 0, sizeof(float) * CHANNELS * s.tile);
     if (coloured) {
-      colour_backward(s, k.weights, k.transposed, k.directions, t, k.gradient);
-      for (int r = 0; r < range.pixels; ++r) {
-        Direction& d = k.directions[r];
+      colour_backward(s, k.weights, k.transposed, few.directions, t, k.gradient);
+      for (int r = 0; r < few.pixels; ++r) {
+        Direction& d = few.directions[r];
         direction_backward(s, k.weights, d, k.gradient);
         o.g_pose[0] += d.gd[0] * d.d[1] - d.gd[1] * d.d[0];
       }
     }
     density_backward(s, k.weights, k.transposed, t, k.gradient);
-    encode_backward(s, t.g_encoding, t.encoding, t.gx, n);
+    encode_backward(s, t.g_encoding, t.encoding, t.gx, t.padded);
     points_backward(s, k.weights, t, k.gradient, pose, o.g_pose);
   }
+  few.first_pixel += few.pixels;
+  few.pixels = t.count = 0;
+}
+
+// Densities of a tile's crossings, and what they say without colour.
+inline void tile_forward(const Sizes& s, const PixelModel& m, const Prepared& v, const TileRange& range,
+                         const PoseMatrix& pose, float offset, Scratch& k) {
+  const Pixel* pixels = v.pixels + range.first_pixel;
+  Tile& t = k.tile;
+  int first = pixels[0].first, n = up(range.points, LANES);
+  t.count = range.points, t.padded = n;
+  for (int p = 0; p < n; p += LANES) {
+    Vec at[3], q[3];
+    for (int i = 0; i < 3; ++i) at[i] = load(v.crossings.at[i] + first + p);
+    pose.to_object(at[0], at[1], at[2], q);
+    for (int i = 0; i < 3; ++i) store(t.q[i] + p, q[i]);
+  }
+  for (int p = 0; p < n; ++p) {
+    Window w = window(t.q[0][p], t.q[1][p], t.q[2][p]);
+    t.window[p] = w.value, t.slope[p] = w.slope, t.axis[p] = w.axis;
+  }
+  density_forward(s, k.weights, t);
+  composite(m, v.crossings, pixels, range.pixels, m.per_density / pose.inverse, offset, t, k.composite,
+            k.sums + range.first_pixel);
+}
+
+inline void one_particle(const Sizes& s, const PixelModel& m, const Prepared& v, Scratch& k, const Particle& o) {
+  unpack_weights(s, o.weights, k.weights);
+  if (o.g_pose) {
+    k.transposed.set(s, k.weights);
+    memset(k.gradient.first, 0, sizeof(float) * k.gradient.count);
+    for (int i = 0; i < 6; ++i) o.g_pose[i] = 0.0f;
+  }
+  PoseMatrix pose(o.pose);
+  PixelGradient terms;
+  Few& few = k.few;
+  for (int j = o.part; j < v.tile_count; j += o.parts) {
+    const TileRange& range = v.tiles[j];
+    tile_forward(s, m, v, range, pose, o.pose[5], k);
+    for (int i = 0; i < range.pixels; ++i) {
+      int pixel = range.first_pixel + i;
+      const Pixel& ray = v.pixels[pixel];
+      const float* weight = k.composite.weight + ray.first;
+      int counted = 0;
+      for (int p = 0; p < ray.count; ++p) counted += weight[p] > NEGLIGIBLE;
+      bool next = few.pixels && few.first_pixel + few.pixels != pixel;  // another thread has the tile between
+      if (next || few.tile.count + counted > s.tile || (few.pixels && v.pixels[few.first_pixel].coloured != ray.coloured))
+        finish(s, m, v, k, pose, o, terms);
+      if (few.pixels == 0) few.first_pixel = pixel, few.tile.count = 0;
+      if (ray.coloured) {
+        const float* d = v.directions + 3 * pixel;
+        Direction& to = few.directions[few.pixels];
+        to.d[0] = pose.c * d[0] + pose.s * d[1], to.d[1] = pose.c * d[1] - pose.s * d[0], to.d[2] = d[2];
+        direction_forward(s, k.weights, to);
+      }
+      int first = v.pixels[range.first_pixel].first;
+      for (int p = 0; p < ray.count; ++p) {
+        if (!(weight[p] > NEGLIGIBLE)) continue;
+        int to = few.tile.count++;
+        copy_point(s, k.tile, ray.first - first + p, few.tile, to);
+        few.source[to] = ray.first + p, few.tile.ray[to] = few.pixels;
+      }
+      few.ends[few.pixels++] = few.tile.count;
+    }
+  }
+  finish(s, m, v, k, pose, o, terms);
+  *o.value = (float)terms.value + nothing(s, k.weights, o.pose);
+  if (!o.g_pose) return;
   pack_weights(s, k.gradient, o.g_weights);
-  float nothing = 0.0f;  // not a number where a weight or the pose is none: a ReLU would hide it
-  for_each_part(s, k.weights, [&](const float* part, int rows, int columns, int stride, bool transposed) {
-    for (int i = 0; i < (transposed ? columns : rows) * stride; ++i) nothing += part[i] * 0.0f;
-  });
-  for (int i = 0; i < 6; ++i) nothing += o.pose[i] * 0.0f;
-  *o.value = (float)terms.value + nothing;
   o.g_pose[3] += terms.log_scale;
   o.g_pose[5] = terms.offset;
 }
@@ -215,20 +248,21 @@ inline int tile_of(const View& v) {
   return up(longest > FARSIDE_TILE ? longest : FARSIDE_TILE, 16);
 }
 
-// The number of floats that `run` needs.
-int64_t scratch_floats(const FieldSizes& f, const PixelModel& m, const View& v) {
+// The number of floats that `run_view` needs.
+int64_t view_floats(const FieldSizes& f, const PixelModel& m, const View& v) {
   Arena a{nullptr};
   Sizes s(f, tile_of(v));
   Prepared prepared(v, m, s, a);
-  Scratch scratch(s, v.rays, a);
+  Scratch scratch(s, v.rays, prepared.points, a);
   return a.used;
 }
 
-void run(const FieldSizes& f, const PixelModel& m, const View& v, const Particle* particles, int count, float* memory) {
+void run_view(const FieldSizes& f, const PixelModel& m, const View& v, const Particle* particles, int count,
+              float* memory) {
   Arena a{memory};
   Sizes s(f, tile_of(v));
   Prepared prepared(v, m, s, a);
-  Scratch scratch(s, v.rays, a);
+  Scratch scratch(s, v.rays, prepared.points, a);
   for (int i = 0; i < count; ++i) one_particle(s, m, prepared, scratch, particles[i]);
 }
 

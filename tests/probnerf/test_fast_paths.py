@@ -18,7 +18,7 @@ from probnerf.prior import PRESETS, ProbNeRF
 from probnerf.types import FREE
 
 
-@pytest.mark.parametrize("condition", ["seen", "half"])
+@pytest.mark.parametrize("condition", ["half", pytest.param("seen", marks=pytest.mark.slow)])
 def test_only_the_crossings_that_tell_are_evaluated_and_the_value_is_the_plain_one(condition):
     """Limits drop crossings that the terms never read, and packing drops padding: values and gradients stay."""
     _, plain, observation, every = scene(condition, depth=True)

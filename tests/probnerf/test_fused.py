@@ -1,4 +1,4 @@
-"""The fused kernel says what `pixel_terms` says in float64, with its gradients: any sizes, rays, instruction set."""
+"""The fused kernel says what plain JAX says in float64, with its gradients: any sizes, rays, instruction set."""
 
 from dataclasses import replace
 from functools import partial
@@ -10,9 +10,11 @@ import pytest
 
 from probnerf import fused
 from probnerf.field import MLPField
-from probnerf.foam import Lattice
+from probnerf.foam import Lattice, window
+from probnerf.infer import explained, opacity_grids
 from probnerf.model import Likelihood, faces_of_view, log_likelihood, pixel_terms, plain_log_likelihood
 from probnerf.prior import PRESETS, ProbNeRF
+from probnerf.store import load_prior
 from probnerf.types import FREE, OBJECT, UNKNOWN, Observation, Pose, Rays
 
 ISAS = ("avx512", "avx2", "plain")
@@ -64,15 +66,16 @@ def drawn(field: MLPField, particles: int, density: float = 0.0) -> tuple[np.nda
     return weights.astype(np.float32), pose.astype(np.float32)
 
 
-def exact(field, likelihood, observation, t, weights, pose):
-    """Values and gradients of `pixel_terms` in float64."""
+def exact(field, likelihood, observation, t, weights, pose, pixel_weight=1.0):
+    """Values and gradients of `pixel_terms` in float64, summed with a weight for each pixel."""
     with jax.enable_x64(True):
 
         def double(tree):
             return jax.tree.map(lambda a: jnp.asarray(a, jnp.float64) if a.dtype == jnp.float32 else a, tree)
 
         def one(w, p):
-            return jnp.sum(pixel_terms(field, w, Pose(*p[:5]), likelihood, double(observation), double(t), p[5]))
+            terms = pixel_terms(field, w, Pose(*p[:5]), likelihood, double(observation), double(t), p[5])
+            return jnp.sum(pixel_weight * terms)
 
         found = jax.jit(jax.vmap(jax.value_and_grad(one, argnums=(0, 1))))(*double((weights, pose)))
         return jax.tree.map(np.asarray, (found[0], *found[1]))
@@ -105,6 +108,33 @@ def test_odd_counts_long_rays_empty_and_saturated_ones(rays: int, colour: int, c
     weights, pose = drawn(field, 2, density)
     found = fused.call(field, likelihood, observation, t, jnp.asarray(weights), jnp.asarray(pose))
     assert_close(found, exact(field, likelihood, observation, t, weights, pose))
+
+
+def test_sharp_walls_of_which_few_crossings_count() -> None:
+    prior, observation = load_prior(None).model, view(96, 48)
+    likelihood = Likelihood(Lattice(32, 1.1, below=0.15), outlier=0.01, wall_sigma=0.05)
+    t = faces_of_view(observation, likelihood)
+    weights = jax.vmap(prior.decode)(jax.random.normal(jax.random.key(0), (4, prior.latent)))
+    pose = drawn(prior.field, 4)[1]
+    found = fused.call(prior.field, likelihood, observation, t, weights, jnp.asarray(pose))
+    assert_close(found, exact(prior.field, likelihood, observation, t, weights, pose))
+
+
+def test_pixels_have_weights_and_values_alone_are_the_same() -> None:
+    field, observation = FIELDS["odd"], view(37, 20)
+    likelihood = Likelihood(Lattice(8, 1.1, below=0.15))
+    t = faces_of_view(observation, likelihood)
+    weights, pose = drawn(field, 3)
+    pixel_weight = np.random.default_rng(0).uniform(0.0, 3.0, 37).astype(np.float32)
+    args = (field, likelihood, observation, t, jnp.asarray(weights), jnp.asarray(pose), jnp.asarray(pixel_weight))
+    found = fused.call(*args)
+    assert_close(found, exact(field, likelihood, observation, t, weights, pose, pixel_weight))
+    alone = fused.call(*args, gradients=False)
+    np.testing.assert_array_equal(alone[0], found[0])
+    assert alone[1].size == alone[2].size == 0
+    for threads in (2, 64):  # a particle in parts
+        one = fused.call(*args[:4], args[4][:1], args[5][:1], args[6], threads=threads, gradients=False)
+        np.testing.assert_allclose(one[0], found[0][:1], rtol=1e-6)
 
 
 def test_a_view_that_says_nothing_is_zero() -> None:
@@ -146,7 +176,7 @@ def test_neither_threads_nor_the_instruction_set_change_the_answer() -> None:
     weights, pose = map(jnp.asarray, drawn(field, 5))
     call = partial(fused.call, field, likelihood, observation, t, weights, pose)
     whole = call(threads=1)
-    for threads in (2, 3, 8):
+    for threads in (2, 3, 5):
         for a, b in zip(call(threads=threads), whole, strict=True):
             np.testing.assert_array_equal(a, b)  # to the last bit
     expected = exact(field, likelihood, observation, t, weights, pose)
@@ -159,6 +189,21 @@ def test_neither_threads_nor_the_instruction_set_change_the_answer() -> None:
         assert_close(found, expected)
     with pytest.raises(jax.errors.JaxRuntimeError, match="no instruction set nonesuch"):
         jax.block_until_ready(call(isa="nonesuch"))
+
+
+@pytest.mark.parametrize("particles", [1, 2, 3])
+def test_threads_share_a_particle_where_there_are_more_of_them(particles: int) -> None:
+    field, observation = FIELDS["small"], view(37, 20)
+    likelihood = Likelihood(Lattice(16, 1.1, below=0.15))
+    t = faces_of_view(observation, likelihood)
+    weights, pose = map(jnp.asarray, drawn(field, particles))
+    call = partial(fused.call, field, likelihood, observation, t, weights, pose)
+    whole = call(threads=1)
+    for threads in (2, 4, 64):  # 64: more than tiles
+        found, again = call(threads=threads), call(threads=threads)
+        assert_close(found, whole)
+        for a, b in zip(found, again, strict=True):
+            np.testing.assert_array_equal(a, b)  # to the last bit
 
 
 @pytest.mark.parametrize(("sample_pose", "sample_delta"), [(True, False), (False, False), (True, True)])
@@ -186,3 +231,92 @@ def test_without_the_kernel_the_plain_path_answers(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(fused, "available", lambda: False)
     monkeypatch.setattr(fused, "call", None)
     np.testing.assert_array_equal(log_likelihood(args, positions), plain_log_likelihood(args, positions))
+
+
+def exact_density(field, weights, pose, points):
+    """Window x density in float64."""
+    with jax.enable_x64(True):
+        weights, pose, points = (np.asarray(a, np.float64) for a in (weights, pose, points))
+
+        def one(w, p):
+            moved = Pose(*p[:5]).to_object(points)
+            return field.density(w, moved) * window(moved)
+
+        return np.asarray(jax.jit(jax.vmap(one))(weights, pose))
+
+
+def scattered(points: int) -> jax.Array:
+    """Points in and about the cube: a third of them and more outside the window."""
+    return jnp.asarray(np.random.default_rng(points).uniform(-1.3, 1.3, (points, 3)), jnp.float32)
+
+
+@pytest.mark.parametrize(
+    ("name", "particles", "points"),
+    [*((name, 3, 1025) for name in FIELDS), ("odd", 1, 1), ("odd", 2, 0), ("odd", 0, 5), ("odd", 1, 2500)],
+)
+def test_density_is_the_plain_one(name: str, particles: int, points: int) -> None:
+    field = FIELDS[name]
+    weights, pose = map(jnp.asarray, drawn(field, particles))
+    found = np.asarray(fused.density(field, weights, pose, scattered(points)))
+    expected = exact_density(field, weights, pose, scattered(points))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * expected.max(initial=0.0))
+    np.testing.assert_array_equal(found == 0, expected == 0)
+
+
+def test_neither_threads_nor_the_instruction_set_change_the_density() -> None:
+    field = FIELDS["small"]
+    weights, pose = map(jnp.asarray, drawn(field, 2))
+    call = partial(fused.density, field, weights, pose, scattered(5000))
+    for threads in (2, 3, 8):
+        np.testing.assert_array_equal(call(threads=threads), call(threads=1))  # to the last bit
+    expected = exact_density(field, weights, pose, scattered(5000))
+    for isa in ISAS:
+        try:
+            found = np.asarray(call(isa=isa))
+        except jax.errors.JaxRuntimeError as error:
+            assert "no instruction set" in str(error) and isa != "plain"
+            continue
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * expected.max())
+
+
+@pytest.mark.parametrize("what", [np.nan, np.inf])
+def test_a_density_of_what_is_no_number_is_none(what: float) -> None:
+    weights, pose = drawn(FIELDS["small"], 3)
+    weights[0, 7], pose[1, 3] = what, what
+    points = scattered(33).at[4, 1].set(what)
+    found = np.isfinite(fused.density(FIELDS["small"], jnp.asarray(weights), jnp.asarray(pose), points))
+    assert not found[:2].any()
+    np.testing.assert_array_equal(found[2], np.arange(33) != 4)
+
+
+def test_density_of_another_field_or_of_a_plane_is_refused() -> None:
+    weights, pose = map(jnp.asarray, drawn(FIELDS["tiny"], 2))
+    for field, row, points, said in (
+        (FIELDS["odd"], pose, scattered(3), "weights, not"),
+        (FIELDS["tiny"], pose[:1], scattered(3), "needs a pose of 6"),
+        (FIELDS["tiny"], pose, scattered(3)[:, :2], "3 coordinates"),
+    ):
+        with pytest.raises(jax.errors.JaxRuntimeError, match=said):
+            jax.block_until_ready(fused.density(field, weights, row, points))
+
+
+@pytest.mark.parametrize("sample_pose", [True, False])
+def test_shapes_are_the_same_without_the_kernel(sample_pose: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, observation = ProbNeRF(PRESETS["small"], jax.random.key(0)), view(37, 20)
+    likelihood = Likelihood(Lattice(16, 1.1, below=0.15), sample_pose=sample_pose)
+    positions = jax.random.normal(jax.random.key(1), (3, likelihood.dim(model)))
+    asked = jnp.ones((13, 13, 13), bool)
+
+    def both():
+        jax.clear_caches()
+        opacity = opacity_grids(model, likelihood, positions, observation.pose_sigma, asked)
+        return np.asarray(opacity, int), np.asarray(explained(model, likelihood, observation, positions))
+
+    opacity, share = both()
+    some = np.random.default_rng(0).random((13, 13, 13)) < 0.3
+    found = opacity_grids(model, likelihood, positions, observation.pose_sigma, jnp.asarray(some))
+    np.testing.assert_array_equal(found, np.where(some, opacity, 0))
+    monkeypatch.setattr(fused, "available", lambda: False)
+    plain, expected = both()
+    assert opacity.max() > 100 and np.abs(opacity - plain).max() <= 1
+    np.testing.assert_allclose(share, expected, atol=1.1 / 37)

@@ -1,0 +1,51 @@
+// Where a tile's points are in the object's frame: the pose (probnerf.types.Pose) and the window (probnerf.foam.window).
+#pragma once
+
+#include "field.h"
+
+namespace FARSIDE_NAMESPACE {
+
+struct PoseMatrix {
+  float c, s, inverse, x, y, z;
+  explicit PoseMatrix(const float* pose)
+      : c(cosf(pose[0])), s(sinf(pose[0])), inverse(expf(-pose[3])), x(pose[1]), y(pose[2]), z(BASE_Z + pose[4]) {}
+
+  // A point, or a vector of them, of the view's frame.
+  template <class T>
+  void to_object(T px, T py, T pz, T* q) const {
+    px -= x, py -= y, pz -= z;
+    q[0] = inverse * (c * px + s * py);
+    q[1] = inverse * (c * py - s * px);
+    q[2] = inverse * pz + BASE_Z;
+  }
+};
+
+struct Window {
+  float value, slope;  // slope: the derivative by ...
+  int axis;            // ... this coordinate
+};
+
+inline Window window(float x, float y, float z) {
+  const float margin = 0.1f, q[3] = {x, y, z};
+  int axis = 0;
+  for (int i = 1; i < 3; ++i)
+    if (fabsf(q[i]) > fabsf(q[axis])) axis = i;
+  float beyond = fabsf(q[axis]) - 1.0f, below = 5.0f * (BASE_Z - 0.02f - z);
+  float u = 1.0f - (beyond > below ? beyond : below) / margin;
+  float slope = beyond > below ? (q[axis] > 0.0f ? -1.0f : 1.0f) : 5.0f;
+  slope = u > 0.0f && u < 1.0f ? 6.0f * u * (1.0f - u) * slope / margin : 0.0f;
+  u = u < 0.0f ? 0.0f : u > 1.0f ? 1.0f : u;
+  return {u * u * (3.0f - 2.0f * u), slope, beyond > below ? axis : 2};
+}
+
+// 0, or not a number where a weight or the pose is none: a ReLU would hide it.
+inline float nothing(const Sizes& s, const Layers& w, const float* pose) {
+  float sum = 0.0f;
+  for_each_part(s, w, [&](const float* part, int rows, int columns, int stride, bool transposed) {
+    for (int i = 0; i < (transposed ? columns : rows) * stride; ++i) sum += part[i] * 0.0f;
+  });
+  for (int i = 0; i < 6; ++i) sum += pose[i] * 0.0f;
+  return sum;
+}
+
+}  // namespace FARSIDE_NAMESPACE

@@ -1,0 +1,66 @@
+// Window x density at points of the view's frame. Threads take turns at pieces of one shape's points, whose places do not
+// depend on the threads' number: nor does the answer. Compiled once per instruction set.
+#include "place.h"
+
+namespace FARSIDE_NAMESPACE {
+
+constexpr int64_t PIECE = 1024;  // points taken at a time
+
+struct Inside {  // a tile's points that are inside the window, and which of a shape's they are
+  Layers weights;
+  Tile tile;
+  int64_t* index;
+  Inside(const Sizes& s, Arena& a) : weights(s, a), tile(s, a), index((int64_t*)a.take(2 * s.tile)) {}
+};
+
+inline void evaluate(const Sizes& s, Inside& k, float* density) {
+  Tile& t = k.tile;
+  t.padded = up(t.count, LANES);
+  for (float* a : {t.q[0], t.q[1], t.q[2], t.window})
+    for (int p = t.count; p < t.padded; ++p) a[p] = 0.0f;
+  density_forward(s, k.weights, t);
+  for (int p = 0; p < t.count; ++p) density[k.index[p]] += t.sigma[p];
+  t.count = 0;
+}
+
+int64_t points_floats(const FieldSizes& f) {
+  Arena a{nullptr};
+  Inside inside(Sizes(f, FARSIDE_TILE), a);
+  return a.used;
+}
+
+void run_points(const FieldSizes& f, const Points& points, const Shape* shapes, int64_t count, int64_t* next,
+                float* memory) {
+  Arena a{memory};
+  Sizes s(f, FARSIDE_TILE);
+  Inside inside(s, a);
+  Tile& t = inside.tile;
+  const Shape* unpacked = nullptr;
+  float none = 0.0f;
+  int64_t pieces = (points.count + PIECE - 1) / PIECE, item;
+  while ((item = __atomic_fetch_add(next, 1, __ATOMIC_RELAXED)) < count * pieces) {
+    const Shape& shape = shapes[item / pieces];
+    if (unpacked != &shape) {
+      unpack_weights(s, shape.weights, inside.weights);
+      none = nothing(s, inside.weights, shape.pose);
+      unpacked = &shape;
+    }
+    PoseMatrix pose(shape.pose);
+    int64_t begin = item % pieces * PIECE, end = begin + PIECE < points.count ? begin + PIECE : points.count;
+    t.count = 0;
+    for (int64_t i = begin; i < end; ++i) {
+      const float* p = points.at + 3 * i;
+      float q[3];
+      pose.to_object(p[0], p[1], p[2], q);
+      shape.density[i] = none + 0.0f * (q[0] + q[1] + q[2]);
+      float inside_window = window(q[0], q[1], q[2]).value;
+      if (inside_window == 0.0f) continue;
+      for (int j = 0; j < 3; ++j) t.q[j][t.count] = q[j];
+      t.window[t.count] = inside_window, inside.index[t.count] = i;
+      if (++t.count == s.tile) evaluate(s, inside, shape.density);
+    }
+    evaluate(s, inside, shape.density);
+  }
+}
+
+}  // namespace FARSIDE_NAMESPACE
