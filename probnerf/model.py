@@ -218,6 +218,33 @@ def pixel_terms(
     return jnp.where(is_object, as_object, jnp.where((status == FREE) | says, as_empty, 0.0))
 
 
+def density_at(
+    field: Field, weights: Float[Array, "w"], pose: Pose | None, points: Float[Array, "... 3"]
+) -> Float[Array, "..."]:
+    """Window x density at points of the view frame; by the kernel, which has no gradient, where it was built."""
+    if isinstance(field, MLPField) and fused.available():
+        row = _row(pose, jnp.zeros(()))
+        return fused.density(field, weights[None], row[None], points.reshape(-1, 3)).reshape(points.shape[:-1])
+    moved = points if pose is None else pose.to_object(points)
+    return field.density(weights, moved) * foam.window(moved)
+
+
+def weighted_terms(
+    field: Field,
+    weights: Float[Array, "w"],
+    pose: Pose,
+    likelihood: Likelihood,
+    observation: Observation,
+    t: Float[Array, "n m"],
+    pixel_weight: Float[Array, "n"],
+) -> Float[Array, ""]:
+    """Sum of `pixel_weight` x `pixel_terms`, differentiable in `weights` alone; by the kernel where it was built."""
+    if isinstance(field, MLPField) and fused.available():
+        row = _row(pose, jnp.zeros(()))
+        return fused.view_terms(field, likelihood, observation, t, weights[None], row[None], pixel_weight)[0]
+    return jnp.sum(pixel_weight * pixel_terms(field, weights, pose, likelihood, observation, t))
+
+
 def mean_colour(premultiplied: Float[Array, "n 3"], opacity: Float[Array, "n 1"]) -> Float[Array, "n 3"]:
     """Sum w_i c_i / O: a pixel's expected colour given a hit; grey where nothing is hit."""
     return (premultiplied + 0.5e-3) / (opacity + 1e-3)
@@ -269,12 +296,16 @@ def _fused(args, positions):
 
     def drawn(position):
         weights, pose = split_position(model, likelihood, position, observation.pose_sigma)
-        offset = range_offset_of(model, likelihood, position, observation.pose_sigma)
-        place = jnp.zeros(5) if pose is None else jnp.stack([pose.yaw, pose.x, pose.y, pose.log_scale, pose.z])
-        return weights, jnp.append(place, offset)
+        return weights, _row(pose, range_offset_of(model, likelihood, position, observation.pose_sigma))
 
     weights, pose = jax.vmap(drawn)(positions)
     return likelihood.power * fused.view_terms(model.field, likelihood, observation, t, weights, pose)
+
+
+def _row(pose: Pose | None, offset: Float[Array, ""]) -> Float[Array, "6"]:
+    """A pose and the ranges' offset as the kernel takes them."""
+    place = jnp.zeros(5) if pose is None else jnp.stack([pose.yaw, pose.x, pose.y, pose.log_scale, pose.z])
+    return jnp.append(place, offset)
 
 
 def plain_log_likelihood(

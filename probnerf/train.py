@@ -31,7 +31,7 @@ from jaxtyping import Array, Float
 from probnerf import foam
 from probnerf.batches import Batch, draw_batch, strata_of
 from probnerf.families.tabletop import description, sample_object
-from probnerf.model import Likelihood, map_with_gradient, pixel_terms
+from probnerf.model import Likelihood, map_with_gradient, weighted_terms
 from probnerf.prior import ProbNeRF, Recognition
 from probnerf.solids import Solids, colour_samples, shape_samples
 from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
@@ -147,8 +147,7 @@ def _ray_terms(shared: tuple, item: tuple[_ObjectRays, tuple | None], weights: A
         colour_count=n,
     )
     t = foam.crossings(rays, likelihood.lattice)
-    terms = pixel_terms(field, weights, pose, likelihood, observation, t)
-    fit = config.effective_rays * jnp.sum(seen.weight * terms)
+    fit = config.effective_rays * weighted_terms(field, weights, pose, likelihood, observation, t, seen.weight)
     return fit if solids is None else fit + _solid_terms(shared, solids, weights)
 
 

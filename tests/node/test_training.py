@@ -60,6 +60,7 @@ def run(folder: Path, *more: str) -> int:
     return main(["train", "--out", str(folder), *sizes, *more])
 
 
+@pytest.mark.slow
 def test_the_recipe_is_handed_over_and_the_weights_exported(
     tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture
 ) -> None:

@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from probnerf import foam
+from probnerf import foam, fused
 from probnerf.batches import draw_batch, strata_of
 from probnerf.families.tabletop import signed_distance
 from probnerf.model import Likelihood
 from probnerf.prior import PRESETS, ProbNeRF
 from probnerf.solids import Solids, colour_samples, draw_solids, shape_samples
 from probnerf.store import load_prior, save_prior
-from probnerf.train import TrainConfig, TrainState, train
+from probnerf.train import TrainConfig, TrainState, initial_state, loss, train
 from probnerf.views import ViewSet, draw_views
 
 CONFIG = TrainConfig(
@@ -47,6 +47,7 @@ def run(solids: Solids, views: ViewSet, folder: Path, steps: int | None = None) 
     return state
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes_with_identical_results(solids: Solids, views: ViewSet, tmp_path: Path) -> None:
     whole = run(solids, views, tmp_path / "whole")
     run(solids, views, tmp_path / "killed", steps=5)  # the last checkpoint is of step 3: steps 4 and 5 are lost
@@ -97,6 +98,24 @@ def test_weighted_rays_estimate_the_mean_over_all_pixels(views: ViewSet) -> None
     error = np.concatenate(estimates)
     assert abs(error.mean()) < 4 * error.std() / np.sqrt(error.size)
     assert error.std() < 0.2
+
+
+def test_the_kernel_trains_as_plain_jax_does(solids: Solids, views: ViewSet, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not fused.available():
+        pytest.skip("the kernel is not built: there was no C++ compiler")
+    state = initial_state(model(), CONFIG)
+    batch = draw_batch(views, strata_of(views), CONFIG, 0, CONFIG.ray_batch)
+    found = []
+    for available in (True, False):
+        monkeypatch.setattr(fused, "available", lambda available=available: available)
+        one = jax.jit(jax.value_and_grad(lambda networks: loss(
+            networks, solids[np.asarray(batch.rows)], batch, jax.random.key(1), jnp.ones(()), LIKELIHOOD, CONFIG
+        )[0]))  # fmt: skip
+        found.append(one((state.model, state.recognition)))
+    (a, g), (b, h) = found
+    assert float(a) == pytest.approx(float(b), rel=1e-5)
+    for x, y in zip(jax.tree.leaves(g), jax.tree.leaves(h), strict=True):
+        np.testing.assert_allclose(x, y, atol=1e-4 * float(np.abs(y).max()) + 1e-12)
 
 
 def test_solid_samples_are_what_the_objects_are(solids: Solids) -> None:
