@@ -86,6 +86,11 @@ class Target(eqx.Module):
     beta: Float[Array, "..."]  # broadcasts against the positions' leading axes
     metric: Metric | None = None
 
+    def value(self, position: Float[Array, "... d"]) -> Float[Array, "..."]:
+        """The log-likelihood at `position`, without its gradient; where not finite, -inf."""
+        value = self.log_likelihood(self.args, position.reshape(-1, position.shape[-1]))
+        return jnp.where(jnp.isfinite(value), value, -jnp.inf).reshape(position.shape[:-1])
+
     def evaluate(self, position: Float[Array, "... d"]) -> "HMCState":
         """Evaluates the likelihood and its gradient at `position`; where not finite, it is -inf with gradient 0."""
         flat = position.reshape(-1, position.shape[-1])

@@ -3,13 +3,12 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, Bool, Float, UInt8
 
 from probnerf import foam, fused
 from probnerf.hmc import AnnealedHMCConfig, StageInfo, annealed_hmc
@@ -17,18 +16,21 @@ from probnerf.model import (
     POSE_SIZE,
     Likelihood,
     Model,
+    density_at,
     faces_of_view,
     log_likelihood,
     pose_of,
     range_offset_of,
     split_position,
 )
+from probnerf.populations import start_from
 from probnerf.prior import ProbNeRF
 from probnerf.proposal import Picture, propose
-from probnerf.smc import TemperedSMCConfig, log_prior, tempered_smc
+from probnerf.smc import TemperedSMCConfig, tempered_smc
 from probnerf.types import BASE_Z, OBJECT, UNKNOWN, Observation, Pose, Posterior
 
 Method = Literal["tempered_smc", "annealed_hmc"]
+_NOWHERE = 50.0  # cube units, outside every window: the kernel passes such points over
 WALL_ERROR = 0.02  # cube units; how well the prior's shapes place a wall
 
 
@@ -37,14 +39,16 @@ def quick_smc() -> TemperedSMCConfig:
     # many particles and one short move: few particles all descend from one or two starts, and lose the other modes
     return TemperedSMCConfig(
         populations=4,
-        particles=96,
+        particles=48,
         start_particles=384,
         moves=1,
         leapfrog_steps=3,
         ess_target=0.4,
+        target_acceptance=0.65,
         final_stages=1,
         keep=1,
         evidence_power=0.5,
+        least_moved=1.0,
     )
 
 
@@ -62,7 +66,7 @@ class InferConfig:
     wall_sigma: float = 0.05  # cube units: the model's own error in a wall's place; wide, for small misfits are shared
     outlier: float = 0.01  # share of ranges from nowhere; small, for a lid over a visible cavity is no outlier
     reach: float = 0.3  # cube units behind a measured range beyond which nothing is asked
-    power: float = 0.5  # kappa: pixels' misfits are not independent, so that each counts as less than one
+    power: float = 1.0  # kappa: what one pixel counts for
     encoder_starts: bool = True  # propose starts by the encoder, in a defensive mixture with the prior
     sample_delta: bool = False  # also infer the weights' perturbation delta
 
@@ -147,7 +151,7 @@ def infer(
         return annealed_hmc(key, log_likelihood, args, dim, hmc, on_stage=on_stage, deadline=deadline), likelihood
     initial = None
     if before is not None:
-        initial = start_from(before)
+        initial = start_from(before, config.smc.populations)
     elif picture is not None and config.encoder_starts and isinstance(model, ProbNeRF) and not config.sample_delta:
         key, start = jax.random.split(key)
         initial = propose(
@@ -165,65 +169,36 @@ def infer(
     return posterior, likelihood
 
 
-def start_from(before: Posterior) -> tuple[Float[Array, "m n d"], Float[Array, "m n"]]:
-    """The samples of tempered SMC as starts for another target: positions per population, and log-densities there.
-
-    Population p's samples are draws of N(q; 0, I) L(q)^beta_p / Z_p. With its own estimate of Z_p, the evidence of the
-    new target starts where the old one's ended, and populations keep their shares.
-    """
-    beta, log_z = before.diagnostics.beta, before.diagnostics.log_evidences
-    m = len(beta)
-    order = np.argsort(np.asarray(before.population), kind="stable")
-    positions = before.positions[order].reshape(m, -1, before.positions.shape[-1])
-    log_likelihoods = before.log_likelihoods[order].reshape(m, -1)
-    return positions, log_prior(positions) + beta[:, None] * log_likelihoods - log_z[:, None]
-
-
-def thin(posterior: Posterior, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(indices, weights f64, population) of about `count` representative samples.
-
-    Each population keeps an equal number of them, taken systematically by weight, and its own share of the weight: a
-    planner sees every population, and their disagreement is the Monte Carlo error.
-    """
-    log_w = np.asarray(posterior.log_weights, np.float64)
-    population = np.asarray(posterior.population)
-    names = np.unique(population)
-    each = max(1, count // len(names))
-    indices, weights = [], []
-    for name in names:
-        members = np.flatnonzero(population == name)
-        w = np.exp(log_w[members] - log_w[members].max())
-        share = np.exp(log_w[members]).sum()
-        at = np.searchsorted(np.cumsum(w) / w.sum(), (np.arange(each) + 0.5) / each)
-        indices.append(members[np.minimum(at, len(members) - 1)])
-        weights.append(np.full(each, share / each))
-    w = np.concatenate(weights)
-    w = w / w.sum() if w.sum() > 0 else np.full(len(w), 1.0 / len(w))
-    return np.concatenate(indices), w, np.repeat(names, each)
-
-
-@partial(jax.jit, static_argnames=("grid",))
+@jax.jit
 def opacity_grids(
-    model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "5"], *, grid: int
+    model: Model,
+    likelihood: Likelihood,
+    positions: Float[Array, "s d"],
+    pose_sigma: Float[Array, "5"],
+    asked: Bool[Array, "g g g"],
 ) -> UInt8[Array, "s g g g"]:
-    """round(255 x opacity across a voxel) of each position's shape on [-1, 1]^3 of the view frame.
+    """round(255 x opacity across a voxel) of each position's shape on [-1, 1]^3 of the view frame, 0 if not `asked`.
 
     A voxel's opacity is the largest at its eight corners: like the truth's, it is a wall where it meets the solid.
     """
+    grid = asked.shape[0]
     axis = jnp.linspace(-1.0, 1.0, grid + 1)
-    points = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    corners = jax.lax.reduce_window(jnp.pad(asked, 1), False, jnp.logical_or, (2, 2, 2), (1, 1, 1), "valid")
+    points = jnp.where(corners[..., None], points, _NOWHERE).reshape(-1, 3)
+    decoded = jax.vmap(model.decode)(positions[:, : model.latent])  # together, as in `plain_log_likelihood`
 
-    def one(position: Float[Array, "d"]) -> UInt8[Array, "g g g"]:
-        weights, pose = split_position(model, likelihood, position, pose_sigma)
-        moved, scale = points, jnp.ones(())
-        if pose is not None:
-            moved, scale = pose.to_object(points), jnp.exp(pose.log_scale)
-        sigma = model.field.density(weights, moved) * foam.window(moved)
+    def one(item: tuple[Float[Array, "d"], Float[Array, "w"]]) -> UInt8[Array, "g g g"]:
+        position, decoded = item
+        weights, pose = split_position(model, likelihood, position, pose_sigma, decoded)
+        sigma = density_at(model.field, weights, pose, points)
+        scale = jnp.ones(()) if pose is None else jnp.exp(pose.log_scale)
         corner = jnp.round(-255.0 * jnp.expm1(-sigma * scale / grid)).astype(jnp.uint8)
         corner = corner.reshape(grid + 1, grid + 1, grid + 1)
-        return jax.lax.reduce_window(corner, jnp.uint8(0), jax.lax.max, (2, 2, 2), (1, 1, 1), "valid")
+        largest = jax.lax.reduce_window(corner, jnp.uint8(0), jax.lax.max, (2, 2, 2), (1, 1, 1), "valid")
+        return jnp.where(asked, largest, 0)
 
-    return jax.lax.map(one, positions)
+    return jax.lax.map(one, (positions, decoded))
 
 
 def poses(model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "5"]) -> Pose:
@@ -267,13 +242,16 @@ def explained(
     t = faces_of_view(observation, likelihood)
     status = observation.status
     tells = (status != UNKNOWN) | (observation.limit > 0)
+    # padding is put where the window is 0, which costs nothing
+    points = jnp.where((t < foam.FAR)[..., None], foam.points_on_rays(observation.rays, t), foam.FAR)
+    decoded = jax.vmap(model.decode)(positions[:, : model.latent])
 
-    def one(position: Float[Array, "d"]) -> Float[Array, ""]:
-        weights, pose = split_position(model, likelihood, position, observation.pose_sigma)
-        points, scale = foam.points_on_rays(observation.rays, t), jnp.ones(())
-        if pose is not None:
-            points, scale = pose.to_object(points), jnp.exp(pose.log_scale)
-        sigma = model.field.density(weights, points) * foam.window(points)
+    def one(item: tuple[Float[Array, "d"], Float[Array, "w"]]) -> Float[Array, ""]:
+        """One position's share, given its decoded weights."""
+        position, decoded = item
+        weights, pose = split_position(model, likelihood, position, observation.pose_sigma, decoded)
+        sigma = density_at(model.field, weights, pose, points)
+        scale = jnp.ones(()) if pose is None else jnp.exp(pose.log_scale)
         faces = foam.composite(sigma, t, scale / likelihood.lattice.cubes)
         w = jnp.exp(faces.log_weight)
         hit = -jnp.expm1(faces.log_transmittance[:, -1])
@@ -287,4 +265,4 @@ def explained(
         )
         return jnp.sum(jnp.where(tells, good > 0.5, False)) / jnp.maximum(jnp.sum(tells), 1)
 
-    return jax.lax.map(one, positions)
+    return jax.lax.map(one, (positions, decoded))

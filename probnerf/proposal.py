@@ -60,25 +60,34 @@ def propose(
     count: int,
     prior_share: float = 0.25,
     flatten: float = 0.5,
+    each: int = 8,
 ) -> tuple[Float[Array, "m n d"], Float[Array, "m n"]]:
-    """Positions of `populations` x `count` starts and their log-density under the mixture."""
+    """Positions of `populations` x `count` starts and their log-density under the mixture.
+
+    `each` starts share a pose, for the encoder is what costs: every one of them has the mixture's law.
+    """
     k = model.latent
     dim = k + POSE_SIZE * likelihood.sample_pose
 
-    def one(key: PRNGKeyArray) -> tuple[Array, Array]:
-        k0, k1, k2 = jax.random.split(key, 3)
-        q = jax.random.normal(k0, (dim,))
-        pose = pose_of(q[k:], pose_sigma) if likelihood.sample_pose else identity_pose()
+    def at_pose(key: PRNGKeyArray) -> tuple[Array, Array]:
+        """`each` starts at one pose, and their log-densities."""
+        pose_key, key = jax.random.split(key)
+        place = jax.random.normal(pose_key, (dim - k,))
+        pose = pose_of(place, pose_sigma) if likelihood.sample_pose else identity_pose()
         mean, precision = potential_at(model, picture, pose, flatten)
-        z = mean + jax.random.normal(k1, (k,)) / jnp.sqrt(precision)
-        guess, _ = model.flow.inverse(z)
-        z_tilde = jnp.where(jax.random.uniform(k2) < prior_share, q[:k], guess)
-        log_z = jnp.logaddexp(
-            jnp.log(prior_share) + _log_normal(z_tilde),
-            jnp.log1p(-prior_share) + _log_encoder(model, z_tilde, mean, precision),
-        )
-        return jnp.concatenate([z_tilde, q[k:]]), log_z + _log_normal(q[k:])
 
-    keys = jax.random.split(key, populations * count)
-    q, log_q = jax.lax.map(one, keys, batch_size=64)
-    return q.reshape(populations, count, dim), log_q.reshape(populations, count)
+        def one(key: PRNGKeyArray) -> tuple[Array, Array]:
+            k0, k1, k2 = jax.random.split(key, 3)
+            guess, _ = model.flow.inverse(mean + jax.random.normal(k1, (k,)) / jnp.sqrt(precision))
+            z_tilde = jnp.where(jax.random.uniform(k2) < prior_share, jax.random.normal(k0, (k,)), guess)
+            log_z = jnp.logaddexp(
+                jnp.log(prior_share) + _log_normal(z_tilde),
+                jnp.log1p(-prior_share) + _log_encoder(model, z_tilde, mean, precision),
+            )
+            return jnp.concatenate([z_tilde, place]), log_z + _log_normal(place)
+
+        return jax.vmap(one)(jax.random.split(key, each))
+
+    poses = -(-count // each)
+    q, log_q = jax.lax.map(at_pose, jax.random.split(key, populations * poses), batch_size=32)
+    return q.reshape(populations, -1, dim)[:, :count], log_q.reshape(populations, -1)[:, :count]

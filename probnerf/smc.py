@@ -6,7 +6,10 @@ move is wasted: waste-free SMC, Dau and Chopin 2022). Then beta takes the longes
 size of the pool under the weights L^(step) (conditional ESS, Zhou, Johansen and Aston 2016), and systematic resampling
 draws the next particles from it. The product of the mean weights estimates the evidence.
 
-What tunes one population's moves (metric, step size) is read off its neighbour, never off the states about to move.
+What tunes moves is never read off the states about to move. A population's metric is its neighbour's; the step size of
+every other particle comes from how often the rest of its own population was accepted (a neighbour may be in a mode of
+another width, and with its steps a population would stand still). Beta waits until a population has moved: copies that
+resampling made agree with each other, and would let it run ahead.
 """
 
 import time
@@ -23,6 +26,7 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from probnerf.hmc import HMCState, LogLikelihood, Metric, StageInfo, Target, gradient_metric, hmc_step, split_r_hat
+from probnerf.populations import log_prior, shares
 from probnerf.resampling import choose, next_beta
 from probnerf.types import Diagnostics, Posterior
 
@@ -38,10 +42,12 @@ class TemperedSMCConfig:
     moves: int = 4  # HMC iterations a stage: a population's pool has moves * particles states
     leapfrog_steps: int = 4
     target_acceptance: float = 0.8
+    least_moved: float = 0.3  # accepted moves of a particle, on average, without which beta waits
     final_stages: int = 2  # at beta = 1
     keep: int = 2  # the last of them, whose pools become the samples
     max_stages: int = 200
     evidence_power: float = 1.0  # a population's share of the weight is its evidence estimate to this power
+    metric: bool = True  # read off the population; without, the prior's
 
     def __post_init__(self) -> None:
         if min(self.populations, self.moves, self.leapfrog_steps, self.max_stages) < 1 or self.particles < 2:
@@ -71,8 +77,9 @@ class _State(eqx.Module):
     log_evidence: Float[Array, "m"]  # of the target at beta
     variance: Float[Array, "m"]  # of log_evidence, were all particles of a pool independent: sum of 1 / ESS - 1 / size
     ancestor: Int[Array, "m p"]  # index of the initial particle
-    step_size: Float[Array, "m"]
+    step_size: Float[Array, "m 2"]  # of every other particle, tuned on the others
     metric: Metric  # with a leading axis m
+    moved: Float[Array, "m"]  # accepted moves of a particle, on average, since beta was raised
 
 
 class _Info(eqx.Module):
@@ -82,16 +89,12 @@ class _Info(eqx.Module):
     divergences: Int[Array, ""]
 
 
-def log_prior(q: Float[Array, "... d"]) -> Float[Array, "..."]:
-    """Log-density of N(0, I) at q, nats."""
-    return -0.5 * jnp.sum(q * q + jnp.log(2 * jnp.pi), axis=-1)
-
-
 def _metrics(gradient, log_w, beta, config: TemperedSMCConfig) -> Metric:
     """Each population's metric, from the weighted pool of the population before it."""
     rank = min(config.moves * config.particles, gradient.shape[-1])
     gradient, log_w = jnp.roll(gradient, 1, axis=0), jnp.roll(log_w, 1, axis=0)
-    return jax.vmap(lambda g, w, b: gradient_metric(g, w, b, rank))(gradient, log_w, beta)
+    metric = jax.vmap(lambda g, w, b: gradient_metric(g, w, b, rank))(gradient, log_w, beta)
+    return metric if config.metric else Metric(metric.basis, jnp.ones_like(metric.frequency))
 
 
 @partial(jax.jit, static_argnames=("log_likelihood", "config"))
@@ -101,38 +104,42 @@ def _start(key, args, q0, log_w0, *, log_likelihood: LogLikelihood, config: Temp
     chunks = -(-count // config.particles)
     padded = jnp.pad(q0, ((0, 0), (0, chunks * config.particles - count), (0, 0)))
     padded = padded.reshape(populations, chunks, config.particles, dim).swapaxes(0, 1)
-    # Chunks as wide as every later evaluation, so that a large start takes no more memory.
-    pool = jax.lax.map(Target(log_likelihood, args, jnp.zeros(())).evaluate, padded)
-    pool = jax.tree.map(lambda a: a.swapaxes(0, 1).reshape(populations, -1, *a.shape[3:])[:, :count], pool)
-
-    value = jnp.where(jnp.isfinite(log_w0), pool.log_likelihood, -jnp.inf)
+    target = Target(log_likelihood, args, jnp.zeros(()))
+    # Chunks as wide as every later evaluation, so that a large start takes no more memory; gradients of the chosen only
+    value = jax.lax.map(target.value, padded).swapaxes(0, 1).reshape(populations, -1)[:, :count]
+    value = jnp.where(jnp.isfinite(log_w0), value, -jnp.inf)
     enough = config.ess_target * config.particles  # a number, so that a larger start buys a longer first step
     beta, log_w, ess = jax.vmap(lambda w, v: next_beta(jnp.zeros(()), w, v, enough))(log_w0, value)
     ancestor = jnp.broadcast_to(jnp.arange(count), log_w.shape)
-    chain, ancestor = choose(key, log_w, (pool, ancestor), config.particles)
+    position, ancestor = choose(key, log_w, (q0, ancestor), config.particles)
+    chain = target.evaluate(position)
     state = _State(
         chain=chain,
         beta=beta,
         log_evidence=logsumexp(log_w, axis=1) - np.log(count),
         variance=1.0 / ess - 1.0 / count,
         ancestor=ancestor,
-        step_size=jnp.full(populations, config.longest_step, jnp.float32),  # weakly typed, it compiles _stage twice
-        metric=_metrics(pool.gradient, log_w, beta, config),
+        step_size=jnp.full(
+            (populations, 2), config.longest_step, jnp.float32
+        ),  # weakly typed, it compiles _stage twice
+        metric=_metrics(chain.gradient, jnp.zeros(ancestor.shape), beta, config),
+        moved=jnp.zeros(populations),
     )
-    return state, _Info(ess, jnp.full(populations, jnp.nan), state.step_size, jnp.zeros((), jnp.int32))
+    return state, _Info(ess, jnp.full(populations, jnp.nan), state.step_size[:, 0], jnp.zeros((), jnp.int32))
 
 
 @partial(jax.jit, static_argnames=("log_likelihood", "config"))
 def _stage(key, state: _State, args, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig):
     """`moves` iterations at the present beta, then the step to the next beta and resampling (at beta = 1: neither)."""
     target = Target(log_likelihood, args, state.beta[:, None], state.metric)
+    half = jnp.arange(config.particles) % 2
 
     def move(carry, key):
-        chain, step = carry
-        chain, info = hmc_step(key, chain, target, step[:, None], config.leapfrog_steps)
-        acceptance = jnp.mean(info.acceptance, axis=1)
+        chain, step = carry  # step: [m, 2], of each half
+        chain, info = hmc_step(key, chain, target, step[:, half], config.leapfrog_steps)
+        acceptance = info.acceptance @ (jax.nn.one_hot(half, 2) / jnp.bincount(half, length=2))
         tuned = jnp.minimum(step * jnp.exp(2.0 * (acceptance - config.target_acceptance)), config.longest_step)
-        return (chain, jnp.roll(tuned, 1)), (chain, acceptance, step, jnp.sum(info.divergent))
+        return (chain, tuned[:, ::-1]), (chain, acceptance.mean(axis=1), step.mean(axis=1), jnp.sum(info.divergent))
 
     move_key, resample_key = jax.random.split(key)
     (chain, step), (pool, acceptance, steps, divergences) = jax.lax.scan(
@@ -144,6 +151,11 @@ def _stage(key, state: _State, args, *, log_likelihood: LogLikelihood, config: T
     beta, log_w, ess = jax.vmap(lambda b, v: next_beta(b, jnp.zeros(size), v, config.ess_target * size))(
         state.beta, pool.log_likelihood
     )
+    # copies that have not moved agree with each other: their weights would let beta run ahead of them
+    moved = state.moved + jnp.sum(acceptance, axis=0)
+    held = moved < config.least_moved
+    beta, ess = jnp.where(held, state.beta, beta), jnp.where(held, size, ess)
+    log_w = jnp.where(held[:, None], 0.0, log_w)
     ancestor = jnp.tile(state.ancestor, (1, config.moves))
     chosen = choose(resample_key, log_w, (pool, ancestor), config.particles)
     tempering = state.beta < 1
@@ -156,7 +168,8 @@ def _stage(key, state: _State, args, *, log_likelihood: LogLikelihood, config: T
     variance = jnp.where(tempering, state.variance + 1.0 / ess - 1.0 / size, state.variance)
     beta = jnp.where(tempering, beta, 1.0)
     metric = _metrics(pool.gradient, log_w, beta, config)
-    state = _State(chain, beta, log_evidence, variance, ancestor, step, metric)
+    moved = jnp.where(held, moved, 0.0)
+    state = _State(chain, beta, log_evidence, variance, ancestor, step, metric, moved)
     info = _Info(jnp.where(tempering, ess, jnp.nan), jnp.mean(acceptance, axis=0), steps[-1], jnp.sum(divergences))
     return state, info, pool
 
@@ -202,7 +215,7 @@ def tempered_smc(
     result: "converged" (beta = 1 and all final stages), else "budget", "stages", "stopped" (by `on_stage`) or
     "interrupted" (Ctrl-C); "underway" in samples asked for between stages. A run stopped before beta = 1 hands back
     equally weighted draws of the tempered target, which is wider than the posterior, and NaN for the evidence.
-    `point_gradients` counts gradient evaluations of whole positions.
+    `point_gradients` counts gradient evaluations of whole positions; the starts are only evaluated, but for the chosen.
     """
     config = config or TemperedSMCConfig()
     begun = time.monotonic()
@@ -213,7 +226,7 @@ def tempered_smc(
         q0, log_w0 = _proposal_start(*_checked(initial, config, dim))
     state, info = _start(start_key, args, q0, log_w0, log_likelihood=log_likelihood, config=config)
 
-    gradients = float(q0.shape[0] * q0.shape[1])
+    gradients = float(config.populations * config.particles)
     kept: list[HMCState] = []  # the pools of the final stages
     cap = config.max_stages if stages is None else min(stages, config.max_stages)
     done, divergences, shortest, acceptance, result = 0, 0, float("inf"), float("nan"), "converged"
@@ -256,10 +269,10 @@ def tempered_smc(
 
 def _checked(initial, config: TemperedSMCConfig, dim: int):
     q0, log_q0 = (jnp.asarray(a, jnp.float32) for a in initial)
-    if q0.ndim != 3 or q0.shape[0] != config.populations or q0.shape[1] < config.particles or q0.shape[2] != dim:
+    if q0.ndim != 3 or q0.shape[0] != config.populations or q0.shape[1] < 1 or q0.shape[2] != dim:
         raise ValueError(
             f"initial positions have shape {q0.shape}; they must be "
-            f"[{config.populations} populations, at least {config.particles} particles, {dim}]"
+            f"[{config.populations} populations, at least 1 particle, {dim}]"
         )
     if log_q0.shape != q0.shape[:2]:
         raise ValueError(f"initial log-densities have shape {log_q0.shape}; the positions want {q0.shape[:2]}")
@@ -289,13 +302,10 @@ def _posterior(config, state: _State, kept: list[HMCState], acceptance, divergen
     values = np.stack([np.asarray(chain.log_likelihood) for chain in kept[-config.keep :]])
     populations = values.shape[1]
     estimates = np.asarray(state.log_evidence, np.float64)
-    log_evidence = error = float("nan")
-    share = np.full(populations, -np.log(populations))
-    if np.all(np.asarray(state.beta) == 1.0):
-        log_evidence = float(np.logaddexp.reduce(estimates) - np.log(populations))
+    reached = bool(np.all(np.asarray(state.beta) == 1.0))
+    share, log_evidence = shares(estimates if reached else np.full(populations, np.nan), config.evidence_power)
+    error = float("nan")
     if np.isfinite(log_evidence):
-        share = config.evidence_power * np.maximum(estimates - log_evidence, -1e4)  # 0 times -inf is no number
-        share -= np.logaddexp.reduce(share)
         ratio = np.exp(estimates - log_evidence)
         spread = np.std(ratio, ddof=1) / np.sqrt(populations) if populations > 1 else 0.0
         within = np.sqrt(np.sum(ratio**2 * np.asarray(state.variance))) / populations

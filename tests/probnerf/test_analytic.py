@@ -32,7 +32,7 @@ from probnerf.smc import tempered_smc
 from probnerf.types import OBJECT, Posterior
 
 CONDITIONS = [(condition, depth) for condition in YAW_OF for depth in (False, True)]
-QUICK = [("seen", False), ("hidden", True), ("half", True)]
+QUICK = [("hidden", True)]
 
 
 def _each(args, positions):

@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 
 from probnerf.hmc import StageInfo
+from probnerf.populations import log_prior
 from probnerf.resampling import next_beta, resample
-from probnerf.smc import TemperedSMCConfig, log_prior, tempered_smc
+from probnerf.smc import TemperedSMCConfig, tempered_smc
 from probnerf.types import Posterior
 
 CONFIG = TemperedSMCConfig(populations=4, particles=32, start_particles=128)
@@ -87,7 +89,7 @@ def test_moments_and_evidence_of_a_gaussian_in_8_dimensions():
     assert float(diagnostics.ess) == pytest.approx(1024 / np.sum(4 * np.array(shares) ** 2), rel=1e-3)
     assert 4 <= int(diagnostics.ancestors) <= 128
     assert int(diagnostics.stages) == len(stages) - 1
-    assert float(diagnostics.point_gradients) == 4 * 128 + (len(stages) - 1) * 4 * 32 * 16
+    assert float(diagnostics.point_gradients) == 4 * 32 + (len(stages) - 1) * 4 * 32 * 16
 
 
 def test_a_scale_ratio_of_200_in_unknown_directions_of_64():
@@ -221,6 +223,40 @@ def test_repeats_exactly_and_compiles_once():
     assert not np.array_equal(first.positions[:128], fresh.positions[:128])
 
 
+def recorded(args, config: TemperedSMCConfig, **how) -> tuple[Posterior, list[StageInfo]]:
+    told: list[StageInfo] = []
+    return tempered_smc(jax.random.key(0), mixture, args, DIM, config, on_stage=told.append, **how), told
+
+
+def test_beta_waits_until_a_population_has_moved():
+    args, *_ = gaussian(DIM, [3e5, 1e5, 1e5])
+    config = replace(CONFIG, moves=1, least_moved=1.0)
+    posterior, told = recorded(args, config)
+    assert posterior.result == "converged"
+    moved, raised = np.zeros(4), 0
+    for before, after in pairwise(told):
+        moved += after.acceptance
+        grew = np.array(after.beta) > np.array(before.beta)
+        np.testing.assert_array_equal(grew, (moved >= 1.0 - 1e-6) & (np.array(before.beta) < 1.0))
+        raised += grew.sum()
+        moved[grew] = 0.0
+    assert raised >= 4 * 3
+    hasty = recorded(args, replace(config, least_moved=0.0))[1]
+    assert len(hasty) < len(told)
+
+
+def test_a_population_in_a_narrow_mode_moves_beside_one_in_a_wide_mode():
+    A = np.sqrt([[[1e5] * 2], [[4.0] * 2]]).swapaxes(1, 2) * np.eye(DIM)[None, :2]
+    args = arguments(A, [A[0][:, 0] * 1.5, A[1][:, 0] * -1.5], [np.log(1e8), 0.0])  # the narrow mode has the mass
+    start = jax.random.normal(jax.random.key(1), (2, 256, DIM))
+    start = start.at[0, :, :2].multiply(0.05).at[0, :, 0].add(1.5)  # one population in each
+    start = start.at[1, :, 0].set(-jnp.abs(start[1, :, 0]))
+    _, told = recorded(args, replace(CONFIG, populations=2), initial=(start, log_prior(start)))
+    assert min(told[-1].acceptance) > 0.4
+    narrow, wide = told[-1].step_size
+    assert narrow < 0.2 * wide
+
+
 def test_evidence_power_flattens_the_populations_shares():
     args, *_ = gaussian(DIM, [100.0, 9.0, 1.0])
     runs = [
@@ -265,8 +301,8 @@ def test_the_step_of_beta():
 
 def test_wrong_input_is_named():
     args, *_ = gaussian(DIM, [4.0])
-    q = jnp.zeros((4, 16, DIM))
-    with pytest.raises(ValueError, match="at least 32 particles"):
+    q = jnp.zeros((4, 0, DIM))
+    with pytest.raises(ValueError, match="at least 1 particle"):
         tempered_smc(jax.random.key(0), mixture, args, DIM, CONFIG, initial=(q, q[..., 0]))
     with pytest.raises(ValueError, match="log-densities"):
         q = jnp.zeros((4, 64, DIM))

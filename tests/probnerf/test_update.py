@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from probnerf.analytic import Args, integrate, scene, total_variation, yaw_histogram
-from probnerf.infer import start_from
 from probnerf.model import faces_of_view, log_likelihood, log_likelihood_one
+from probnerf.populations import start_from
 from probnerf.smc import TemperedSMCConfig, tempered_smc
 from probnerf.types import Posterior, joined
 
@@ -19,6 +19,10 @@ CONFIG = TemperedSMCConfig(populations=4, particles=64)
 def _each(args, positions):
     model, likelihood, observation, t = args
     return jax.vmap(lambda q: log_likelihood_one(model, likelihood, observation, t, q))(positions)
+
+
+def _start(before: Posterior):
+    return start_from(before, CONFIG.populations)
 
 
 def _yaw(posterior: Posterior) -> np.ndarray:
@@ -58,7 +62,7 @@ def test_a_second_view_that_shows_the_handle_collapses_the_yaw_to_the_truth() ->
     first, before = _first()
     args = _both(first, scene("hidden", True, azimuth=110.0, seed=1))
     grid = integrate(_each, args)
-    after = tempered_smc(jax.random.key(1), log_likelihood, args, 9, CONFIG, initial=start_from(before))
+    after = tempered_smc(jax.random.key(1), log_likelihood, args, 9, CONFIG, initial=_start(before))
     assert after.result == "converged"
     assert total_variation(_yaw(after), grid.histogram()) <= 0.1
     assert abs(float(after.log_evidence) - grid.log_evidence) <= max(0.5, 3 * float(after.log_evidence_se))
@@ -68,7 +72,7 @@ def test_a_second_view_that_shows_the_handle_collapses_the_yaw_to_the_truth() ->
 @pytest.mark.slow
 def test_the_same_view_again_asked_of_its_own_posterior_changes_nothing_and_takes_no_tempering() -> None:
     args, before = _first()
-    after = tempered_smc(jax.random.key(2), log_likelihood, args, 9, CONFIG, initial=start_from(before))
+    after = tempered_smc(jax.random.key(2), log_likelihood, args, 9, CONFIG, initial=_start(before))
     assert int(after.diagnostics.stages) == CONFIG.final_stages
     assert float(after.log_evidence) == pytest.approx(float(before.log_evidence), abs=1e-3)
     assert total_variation(_yaw(after), _yaw(before)) <= 0.15
@@ -79,7 +83,7 @@ def test_an_unfinished_posterior_goes_on_from_its_temperature() -> None:
     args, done = _first()
     cut = tempered_smc(jax.random.key(3), log_likelihood, args, 9, CONFIG, stages=1)
     assert cut.result == "stages" and float(cut.diagnostics.beta.min()) < 1
-    after = tempered_smc(jax.random.key(4), log_likelihood, args, 9, CONFIG, initial=start_from(cut))
+    after = tempered_smc(jax.random.key(4), log_likelihood, args, 9, CONFIG, initial=_start(cut))
     assert after.result == "converged"
     assert total_variation(_yaw(after), _yaw(done)) <= 0.15
     assert abs(float(after.log_evidence) - float(done.log_evidence)) <= 1.0
@@ -87,7 +91,7 @@ def test_an_unfinished_posterior_goes_on_from_its_temperature() -> None:
 
 def test_starts_are_weighed_by_the_law_that_they_were_drawn_from() -> None:
     _, before = _first()
-    positions, log_q = start_from(before)
+    positions, log_q = _start(before)
     assert positions.shape[:2] == log_q.shape == (4, len(before.log_weights) // 4)
     log_prior = -0.5 * jnp.sum(positions**2 + jnp.log(2 * jnp.pi), axis=-1)
     order = np.argsort(np.asarray(before.population), kind="stable")

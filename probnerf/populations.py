@@ -1,0 +1,112 @@
+"""Populations of samples: several runs side by side, a run's samples as another's start, a few that stand for all."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from probnerf.hmc import split_r_hat
+from probnerf.types import Posterior
+
+
+def shares(
+    log_evidences: Float[np.ndarray, "m"], power: float
+) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, ""] | float]:
+    """Each population's share of the weight (its logarithm), by its evidence to a power; log of the mean evidence.
+
+    Even shares and NaN where an estimate is missing or none is finite.
+    """
+    even = np.full(len(log_evidences), -np.log(len(log_evidences)))
+    if np.isnan(log_evidences).any():
+        return even, float("nan")
+    mean = float(np.logaddexp.reduce(log_evidences) - np.log(len(log_evidences)))
+    if not np.isfinite(mean):
+        return even, mean
+    share = power * np.maximum(log_evidences - mean, -1e4)  # 0 times -inf is no number
+    return share - np.logaddexp.reduce(share), mean
+
+
+def pooled(posteriors: Sequence[Posterior], evidence_power: float) -> Posterior:
+    """Independent runs of tempered SMC at beta = 1, on one target and of one size, as one posterior of all populations.
+
+    Acceptance and `result` are the last run's; counts are added up. The evidence's error is the populations' spread.
+    """
+    if len(posteriors) == 1:
+        return posteriors[0]
+    m = len(posteriors[0].diagnostics.log_evidences)
+    estimates = np.concatenate([np.asarray(p.diagnostics.log_evidences, np.float64) for p in posteriors])
+    share, log_evidence = shares(estimates, evidence_power)
+    population = np.concatenate([np.asarray(p.population) + m * i for i, p in enumerate(posteriors)])
+    values = np.concatenate([np.asarray(p.log_likelihoods) for p in posteriors])
+    log_weights = share[population] - np.log(len(values) / len(estimates))
+    spread = np.std(np.exp(estimates - log_evidence), ddof=1) / np.sqrt(len(estimates))
+    by_population = values[np.argsort(population, kind="stable")].reshape(len(estimates), -1)
+    every = [p.diagnostics for p in posteriors]
+    return replace(
+        posteriors[-1],
+        positions=jnp.concatenate([p.positions for p in posteriors]),
+        log_weights=jnp.asarray(log_weights, jnp.float32),
+        log_likelihoods=jnp.asarray(values),
+        population=jnp.asarray(population, jnp.int32),
+        log_evidence=jnp.asarray(log_evidence, jnp.float32),
+        log_evidence_se=jnp.asarray(spread, jnp.float32),
+        diagnostics=replace(
+            every[-1],
+            divergences=jnp.stack([d.divergences for d in every]).sum(),
+            r_hat=jnp.asarray(split_r_hat(by_population), jnp.float32),
+            ess=jnp.asarray(1.0 / np.sum(np.exp(2.0 * log_weights)), jnp.float32),
+            ancestors=jnp.stack([d.ancestors for d in every]).sum(),
+            stages=jnp.stack([d.stages for d in every]).sum(),
+            point_gradients=jnp.stack([d.point_gradients for d in every]).sum(),
+            beta=jnp.concatenate([d.beta for d in every]),
+            log_evidences=jnp.asarray(estimates, jnp.float32),
+        ),
+    )
+
+
+def start_from(before: Posterior, populations: int) -> tuple[Float[Array, "m n d"], Float[Array, "m n"]]:
+    """The samples of tempered SMC as starts for another target: positions per population, and log-densities there.
+
+    Population p's samples are draws of N(q; 0, I) L(q)^beta_p / Z_p. With its own estimate of Z_p, the evidence of the
+    new target starts where the old one's ended, and populations keep their shares. Where there were more than
+    `populations`, several stand together as one. Raises ValueError where they do not divide.
+    """
+    beta, log_z = before.diagnostics.beta, before.diagnostics.log_evidences
+    m, size = len(beta), before.positions.shape[-1]
+    if m % populations:
+        raise ValueError(f"{m} populations of samples do not divide into {populations}")
+    order = np.argsort(np.asarray(before.population), kind="stable")
+    positions = before.positions[order].reshape(m, -1, size)
+    log_likelihoods = before.log_likelihoods[order].reshape(m, -1)
+    log_q = log_prior(positions) + beta[:, None] * log_likelihoods - log_z[:, None]
+    return positions.reshape(populations, -1, size), log_q.reshape(populations, -1)
+
+
+def log_prior(q: Float[Array, "... d"]) -> Float[Array, "..."]:
+    """Log-density of N(0, I) at q, nats."""
+    return -0.5 * jnp.sum(q * q + jnp.log(2 * jnp.pi), axis=-1)
+
+
+def thin(posterior: Posterior, count: int) -> tuple[Int[np.ndarray, "s"], Float[np.ndarray, "s"], Int[np.ndarray, "s"]]:
+    """(indices, weights f64, population) of about `count` representative samples.
+
+    Each population keeps an equal number of them, taken systematically by weight, and its own share of the weight: a
+    planner sees every population, and their disagreement is the Monte Carlo error.
+    """
+    log_w = np.asarray(posterior.log_weights, np.float64)
+    population = np.asarray(posterior.population)
+    names = np.unique(population)
+    each = max(1, count // len(names))
+    indices, weights = [], []
+    for name in names:
+        members = np.flatnonzero(population == name)
+        w = np.exp(log_w[members] - log_w[members].max())
+        share = np.exp(log_w[members]).sum()
+        at = np.searchsorted(np.cumsum(w) / w.sum(), (np.arange(each) + 0.5) / each)
+        indices.append(members[np.minimum(at, len(members) - 1)])
+        weights.append(np.full(each, share / each))
+    w = np.concatenate(weights)
+    w = w / w.sum() if w.sum() > 0 else np.full(len(w), 1.0 / len(w))
+    return np.concatenate(indices), w, np.repeat(names, each)

@@ -1,0 +1,73 @@
+"""Populations side by side: shares by evidence, runs that are pooled, samples as starts in fewer populations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from probnerf.populations import log_prior, pooled, shares, start_from
+from probnerf.smc import TemperedSMCConfig, tempered_smc
+from probnerf.types import Posterior
+
+CONFIG = TemperedSMCConfig(populations=2, particles=64)
+PRECISION, AT = 8.0, 0.7
+
+
+def _log_likelihood(_: None, q: jax.Array) -> jax.Array:
+    return -0.5 * PRECISION * (q[:, 0] - AT) ** 2
+
+
+def _run(seed: int) -> Posterior:
+    return tempered_smc(jax.random.key(seed), _log_likelihood, None, 3, CONFIG)
+
+
+def test_shares_follow_the_evidence_to_a_power() -> None:
+    estimates = np.array([0.0, np.log(3.0), -np.inf])
+    share, mean = shares(estimates, 1.0)
+    np.testing.assert_allclose(np.exp(share), [0.25, 0.75, 0.0], atol=1e-12)
+    assert mean == pytest.approx(np.log(4.0 / 3.0))
+    np.testing.assert_allclose(np.exp(shares(estimates[:2], 0.0)[0]), [0.5, 0.5])
+    for missing in (np.array([0.0, np.nan]), np.full(2, -np.inf)):
+        np.testing.assert_allclose(np.exp(shares(missing, 1.0)[0]), [0.5, 0.5])
+
+
+def test_pooled_runs_are_the_posterior_with_the_known_mean_and_evidence() -> None:
+    runs = [_run(seed) for seed in range(4)]
+    whole = pooled(runs, CONFIG.evidence_power)
+    w = np.exp(np.asarray(whole.log_weights, np.float64))
+    assert w.sum() == pytest.approx(1.0, abs=1e-5)
+    # N(0, 1) times exp(-P (q - a)^2 / 2): mean P a / (1 + P), evidence exp(-P a^2 / 2 (1 + P)) / sqrt(1 + P)
+    assert w @ np.asarray(whole.positions)[:, 0] == pytest.approx(PRECISION * AT / (1 + PRECISION), abs=0.05)
+    log_z = -0.5 * PRECISION * AT**2 / (1 + PRECISION) - 0.5 * np.log(1 + PRECISION)
+    assert float(whole.log_evidence) == pytest.approx(log_z, abs=4 * float(whole.log_evidence_se) + 1e-3)
+    assert len(np.unique(whole.population)) == 8 and whole.positions.shape[0] == 4 * runs[0].positions.shape[0]
+    assert float(whole.diagnostics.point_gradients) == sum(float(r.diagnostics.point_gradients) for r in runs)
+    assert pooled(runs[:1], 1.0) is runs[0]
+
+
+def test_a_population_weighs_by_its_evidence_among_all_runs() -> None:
+    runs = [_run(0), _run(1)]
+    whole = pooled(runs, 1.0)
+    population, w = np.asarray(whole.population), np.exp(np.asarray(whole.log_weights, np.float64))
+    total = np.bincount(population, weights=w)
+    estimates = np.concatenate([np.asarray(r.diagnostics.log_evidences, np.float64) for r in runs])
+    np.testing.assert_allclose(total, np.exp(estimates) / np.exp(estimates).sum(), rtol=1e-4)
+
+
+def test_pooled_samples_start_fewer_populations_at_their_own_densities() -> None:
+    runs = [_run(0), _run(1)]
+    whole = pooled(runs, 1.0)
+    q, log_q = start_from(whole, 2)
+    assert q.shape == (2, whole.positions.shape[0] // 2, 3)
+    estimates = np.asarray(whole.diagnostics.log_evidences)
+    value = log_prior(q) + _log_likelihood(None, q.reshape(-1, 3)).reshape(2, -1)
+    np.testing.assert_allclose(
+        np.asarray(value - log_q).reshape(4, -1), np.repeat(estimates[:, None], q.shape[1] // 2, 1), atol=1e-4
+    )
+    again = tempered_smc(jax.random.key(9), _log_likelihood, None, 3, CONFIG, initial=(q, log_q))
+    assert again.result == "converged" and float(again.log_evidence) == pytest.approx(
+        float(whole.log_evidence), abs=0.3
+    )
+    with pytest.raises(ValueError, match="do not divide"):
+        start_from(whole, 3)
+    assert jnp.isfinite(log_q).all()
