@@ -2,12 +2,14 @@
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 
 from calibration.camera import Camera
 from perception.monocular import plane_depth
 from perception.observe import ObjectFrame
 from perception.segment import Segment
 from perception.source import Frame
+from probnerf.types import BASE_Z
 
 
 def seen_voxels(
@@ -19,14 +21,32 @@ def seen_voxels(
     In a frame without any depth a ray ends on the supposed plane where its pixel is FREE of the object; the rays of
     other pixels may end anywhere, so that nothing on them is seen, not even before the object.
     """
+    half_diagonal = np.sqrt(3.0) / grid * cube.half_extent
+    return _behind_the_end(frame, segment, cube, grid) <= half_diagonal
+
+
+def answered_voxels(
+    frame: Frame, segment: Segment, cube: ObjectFrame, grid: int = 64
+) -> Bool[np.ndarray, "grid grid grid"]:
+    """Voxels that shapes need to be asked of: all but those at least two voxels before a measured end and two voxels
+    from any that are not. That space is free whatever a shape says.
+    """
+    rest = ~(_behind_the_end(frame, segment, cube, grid) <= -4.0 / grid * cube.half_extent)
+    z = -1.0 + (np.arange(grid) + 0.5) * 2.0 / grid
+    return rest | ndimage.binary_dilation(rest & (z > BASE_Z), iterations=2)
+
+
+def _behind_the_end(
+    frame: Frame, segment: Segment, cube: ObjectFrame, grid: int
+) -> Float[np.ndarray, "grid grid grid"]:
+    """How far each voxel's centre lies behind the end of its ray, m; NaN where that is not known."""
     points, pixels, inside = _voxels(frame.camera, cube, grid)
     depth = plane_depth(frame.camera, cube.plane, segment.status) if frame.depth is None else frame.depth
     z = depth[pixels[:, 1], pixels[:, 0]]
     distance = np.linalg.norm(points, axis=1)
-    half_diagonal = np.sqrt(3.0) / grid * cube.half_extent
     with np.errstate(invalid="ignore"):
-        seen = inside & (distance * (1.0 - z / points[:, 2]) <= half_diagonal)
-    return seen.reshape(grid, grid, grid)
+        behind = np.where(inside, distance * (1.0 - z / points[:, 2]), np.nan)
+    return behind.reshape(grid, grid, grid)
 
 
 def inside_view(camera: Camera, cube: ObjectFrame, grid: int = 64) -> Bool[np.ndarray, "grid grid grid"]:
