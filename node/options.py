@@ -22,7 +22,7 @@ class Replay:
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: out/<name of the source>)")] = None
     """Folder for object_<id>.npz and object_<id>.png, and for the frame itself (frame/)."""
     budget: Annotated[
-        float | None, arg(metavar="SECONDS", help_behavior_hint="(default: 60; with --stages: no limit)")
+        float | None, arg(metavar="SECONDS", help_behavior_hint="(default: 90; with --stages: no limit)")
     ] = None
     """Time for the whole job, shared by its objects."""
     stages: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: until it has converged)")] = None

@@ -26,7 +26,7 @@ from probnerf.hmc import StageInfo
 from probnerf.infer import Method
 from probnerf.store import Prior, load_prior
 
-BUDGET_S = 60.0
+BUDGET_S = 90.0
 PICTURE_S = 3.0  # of each object's share of the budget, kept back for its picture
 
 
@@ -37,7 +37,7 @@ class ReplayConfig:
     source: Path | None = None  # frame folder or recording; None: the one that ships with the project
     object: int | None = None  # the one object to infer; None: all
     out: Path | None = None  # None: out/<name of the source>
-    budget: float | None = None  # s for the whole job; None: 60, or no limit where `stages` is given
+    budget: float | None = None  # s for the whole job; None: 90, or no limit where `stages` is given
     stages: int | None = None  # of the sampler, per object
     seed: int = 0
     method: Method | None = None  # None: that of `controller.infer`
@@ -110,6 +110,8 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
         if not done and not is_source:
             (kept / "meta.json").unlink(missing_ok=True)  # an earlier run's frame is not read beside this one's objects
         path = publish(config.folder, frame, found, result.hypotheses, result.seconds, out)
+        for line in result.log:
+            out.print(f"  {line}", highlight=False, soft_wrap=True)
         if not done:
             _clear_others(config.folder, path, result.hypotheses if config.object is not None else None, out)
             if not is_source:

@@ -1,56 +1,61 @@
-"""How much model a scene needs: from a frame's segment to published hypotheses. One fixed amount so far."""
+"""How much model a scene needs: from a frame's segment to published hypotheses, with no more than that.
+
+A level is an amount of model: particles divided by a number. The controller begins with the least, and has an answer
+to publish after every stage. Where the shapes of a level leave too many pixels unexplained (a posterior-predictive
+check) or the Monte Carlo error of the answer is above the tolerance, the next level begins, afresh: what a small
+population has dropped a larger one could not find again. At the last level further independent populations may join.
+By default there is one level: a third of its particles gave as small an error but no handle behind the shipped mug, and
+no check of the answer itself told (`farside replay` with `controller.levels: [3, 1]`).
+
+Lattice and rays are the same at every level: with half of both, shapes were worse on easy scenes as on hard ones, and
+no check told where (`farside bench frontier` has a coarse lattice among its levers).
+"""
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
 
 from perception.hypotheses import Hypotheses
 from perception.observe import ObjectFrame, ObserveConfig, observe
+from perception.publish import PublishConfig, View, published
 from perception.seen import seen_voxels
 from perception.segment import Segment
 from perception.source import Frame
 from probnerf.families.render import look_at, pinhole_rays
 from probnerf.hmc import StageInfo
-from probnerf.infer import (
-    InferConfig,
-    crossings_of,
-    explained,
-    infer,
-    likelihood_of,
-    opacity_grids,
-    poses,
-    scaled_about,
-    thin,
-    without_sizes,
-)
+from probnerf.infer import InferConfig, crossings_of, infer, likelihood_of
 from probnerf.model import Likelihood
+from probnerf.populations import pooled
 from probnerf.proposal import Picture
 from probnerf.store import Prior
-from probnerf.types import BASE_Z, OBJECT, UNKNOWN, Observation, Posterior
+from probnerf.types import OBJECT, UNKNOWN, Observation, Posterior
 from probnerf.views import ENCODER_RADIUS
 
 
 @dataclass(frozen=True)
-class ControllerConfig:
-    """What is inferred, and how finely it is published."""
+class ControllerConfig(PublishConfig):
+    """What is inferred at most, when less is enough, and how finely it is published."""
 
-    infer: InferConfig = field(default_factory=InferConfig)
+    infer: InferConfig = field(default_factory=InferConfig)  # of the largest level
     observe: ObserveConfig = field(default_factory=ObserveConfig)
-    hypotheses: int = 48  # shapes published
-    first_hypotheses: int = 16  # ... while better ones are under way
-    grid: int = 64  # voxels per axis, G
-    out_of_model_below: float = 0.8  # share of telling pixels explained on average; validation vessels: 0.86 to 0.98
+    first_hypotheses: int = 8  # published while better ones are under way
+    levels: tuple[int, ...] = (1,)  # particles of each are the largest level's divided by this
+    unexplained: float = 0.1  # share of pixels at which a level is too small
+    tolerance: float = 0.025  # Monte Carlo error of the mean unseen occupancy that is good enough
+    runs: int = 2  # at the last level, at most, each with populations of its own
 
     def __post_init__(self) -> None:
-        if min(self.hypotheses, self.first_hypotheses, self.grid) < 1 or self.grid > 512:
+        super().__post_init__()
+        falling = all(a > b for a, b in zip(self.levels, self.levels[1:], strict=False))
+        if min(self.first_hypotheses, self.runs, *self.levels, len(self.levels)) < 1 or not falling:
             raise ValueError(
-                f"hypotheses {self.hypotheses} and first_hypotheses {self.first_hypotheses} must be 1 or more, and grid"
-                f" {self.grid} from 1 to 512"
+                f"first_hypotheses {self.first_hypotheses} and runs {self.runs} must be 1 or more, and levels"
+                f" {self.levels} must fall, the least amount of model first"
             )
 
 
@@ -64,6 +69,7 @@ class Estimate:
     observation: Observation
     object_frame: ObjectFrame
     seconds: float
+    log: tuple[str, ...] = ()  # why the model grew, and why it stopped, a line a level
 
 
 def estimate(
@@ -100,17 +106,6 @@ def estimate(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """What is conditioned on, and the frame that the answer is given in: the newest one."""
-
-    frame: Frame
-    segment: Segment
-    observation: Observation  # of this frame, or of several joined
-    object_frame: ObjectFrame  # in this frame's camera
-    seen: Bool[np.ndarray, "g g g"]  # by any frame
-
-
 def infer_view(
     view: View,
     prior: Prior,
@@ -123,112 +118,149 @@ def infer_view(
     on_stage: Callable[[StageInfo], bool | None] | None = None,
     on_answer: Callable[[Hypotheses], None] | None = None,
 ) -> Estimate:
-    """Sample the posterior of a view and publish it; `before` is the posterior of an earlier view of the same cube."""
-    begun = time.monotonic()
-    likelihood = likelihood_of(config.infer, view.observation)
-    first = replace(config, hypotheses=config.first_hypotheses)
-    answered, cost = begun, 0.0
+    """Sample the posterior of a view and publish it, with as much model as it takes.
 
-    def told(info: StageInfo) -> bool | None:
-        nonlocal answered, cost
-        if on_stage is not None and on_stage(info):
+    `before` is the posterior of an earlier view of the same cube; only the largest level goes on from it. `stages` and
+    `deadline` are for all levels together. A level that is cut short leaves the last whole answer standing.
+    """
+    begun = time.monotonic()
+    work = _Work(view, prior, config, seed, before, deadline, stages, on_stage, on_answer)
+    grows = before is None and config.infer.method == "tempered_smc"
+    last = config.levels[-1] if grows else 1
+    plan = [(level, 0) for level in config.levels[:-1] if grows] + [
+        (last, run) for run in range(config.runs if grows else 1)
+    ]
+    runs: list[Posterior] = []  # of one level, all whole
+    log: list[str] = []
+    while plan:
+        (level, run), *plan = plan
+        posterior = work.sample(level, run)
+        whole = posterior.result == "converged"
+        if not whole and runs:
+            log.append(f"{work.amount(level, run)}: cut short ({posterior.result}), the answer before it stands")
+            runs[-1], work.answer = work.ended(runs[-1], posterior.result)
+            break
+        runs = [posterior] if run == 0 else [*runs, posterior]
+        together = pooled(runs, config.infer.smc.evidence_power)
+        h = work.answer = work.publish(together, config.hypotheses)
+        missed = 1.0 - h.diagnostics["explained"]
+        if not whole or (missed <= config.unexplained and h.monte_carlo_error <= config.tolerance):
+            plan = []
+        grown = f" -> {work.amount(*plan[0])}" if plan else ""
+        why = f"error {h.monte_carlo_error:.3f}, {100 * missed:.0f}% of pixels not explained"
+        log.append(f"{work.amount(level, run)}{grown}: {why}")
+        if plan and (short := work.short_of(level, *plan[0])) is not None:
+            log.append(f"{work.amount(*plan[0])}: no room left ({short})")
+            runs[-1], work.answer = work.ended(runs[-1], short)
+            break
+        if plan and on_answer is not None:
+            on_answer(replace(h, result="underway"))
+    assert work.answer is not None
+    if on_answer is not None:
+        on_answer(work.answer)
+    found = pooled(runs, config.infer.smc.evidence_power)
+    seconds = time.monotonic() - begun
+    return Estimate(work.answer, found, work.likelihood, view.observation, view.object_frame, seconds, tuple(log))
+
+
+@dataclass(eq=False)
+class _Work:
+    """One view's sampling: what all levels share, and what they have cost."""
+
+    view: View
+    prior: Prior
+    config: ControllerConfig
+    seed: int
+    before: Posterior | None
+    deadline: float | None
+    cap: int | None  # stages
+    on_stage: Callable[[StageInfo], bool | None] | None
+    on_answer: Callable[[Hypotheses], None] | None
+    stages: int = 0  # done
+    point_gradients: float = 0.0
+    answer: Hypotheses | None = None  # of a whole level
+    answered: float = field(default_factory=time.monotonic)  # when the last one that was underway was given,
+    answering: float = 0.0  # s; and what it took
+    stage_s: list[float] = field(default_factory=list)  # s; each stage of the latest run
+    since: float = 0.0  # when the stage at hand began
+
+    @cached_property
+    def likelihood(self) -> Likelihood:
+        """Of the largest level."""
+        return likelihood_of(self.config.infer, self.view.observation)
+
+    @cached_property
+    def picture(self) -> Picture | None:
+        """What the encoder sees. It was trained on objects with ranges; without, its starts are no better than the
+        prior's: on eight validation objects a third of their effective number at a temperature of 10.
+        """
+        if self.view.frame.depth is None:
+            return None
+        return crop(self.view.frame, self.view.segment, self.view.object_frame, self.prior.model.preset.image_size)
+
+    def sample(self, level: int, run: int) -> Posterior:
+        """One run of `infer` at a level."""
+        observation = self.view.observation
+        key = jax.random.key(self.seed)
+        self.stage_s, self.since = [], time.monotonic()
+        posterior, likelihood = infer(
+            jax.random.fold_in(key, 10 * level + run) if self.stages else key,
+            self.prior.model,
+            observation,
+            _lesser(self.config.infer, level),
+            picture=self.picture,
+            before=self.before,
+            on_stage=self._told,
+            deadline=self.deadline,
+            stages=None if self.cap is None else self.cap - self.stages,
+        )
+        self.stages += int(posterior.diagnostics.stages)
+        self.point_gradients += float(posterior.diagnostics.point_gradients) * crossings_of(likelihood, observation)
+        return posterior
+
+    def _told(self, info: StageInfo) -> bool | None:
+        if self.on_stage is not None and self.on_stage(replace(info, stage=self.stages + info.stage)):
             return True
         now = time.monotonic()
-        # the first answer at once; a later one when the time it takes is a fifth of what went by
-        if on_answer is not None and now - answered >= 4.0 * cost:
-            on_answer(published(view, info.samples(), likelihood, prior, first, seed))
-            answered = time.monotonic()
-            cost = answered - now
+        self.stage_s.append(now - self.since)
+        # the first answer at once; a later one when the time it takes is a fifth of what went by; none that is
+        # underway once a level is whole
+        if self.on_answer is not None and self.answer is None and now - self.answered >= 4.0 * self.answering:
+            self.on_answer(self.publish(info.samples(), self.config.first_hypotheses))
+            self.answered = time.monotonic()
+            self.answering = self.answered - now
+        self.since = time.monotonic()
         return None
 
-    # The encoder was trained on objects with ranges. Without, its starts are no better than the prior's: on eight
-    # validation objects a third of their effective number at a temperature of 10, and no higher likelihood.
-    size = prior.model.preset.image_size
-    picture = None if view.frame.depth is None else crop(view.frame, view.segment, view.object_frame, size)
-    posterior, likelihood = infer(
-        jax.random.key(seed),
-        prior.model,
-        view.observation,
-        config.infer,
-        picture=picture,
-        before=before,
-        on_stage=told,
-        deadline=deadline,
-        stages=stages,
-    )
-    hypotheses = published(view, posterior, likelihood, prior, config, seed)
-    if on_answer is not None:
-        on_answer(hypotheses)
-    seconds = time.monotonic() - begun
-    return Estimate(hypotheses, posterior, likelihood, view.observation, view.object_frame, seconds)
+    def publish(self, posterior: Posterior, count: int) -> Hypotheses:
+        """The samples at hand as planners read them."""
+        more = {"point_gradients": self.point_gradients, "evidence_power": self.config.infer.smc.evidence_power}
+        config = replace(self.config, hypotheses=count)
+        h = published(self.view, posterior, self.likelihood, self.prior, config, self.seed, more)
+        return replace(h, stage=max(self.stages, h.stage))
+
+    def ended(self, posterior: Posterior, result: str) -> tuple[Posterior, Hypotheses]:
+        """The last whole answer, with why there was none after it."""
+        assert self.answer is not None
+        return replace(posterior, result=result), replace(self.answer, result=result, stage=self.stages)
+
+    def short_of(self, level: int, next_level: int, run: int) -> str | None:
+        """Which limit leaves no room for a next run, if one does: the time is that of the run before, in proportion."""
+        if self.cap is not None and self.stages >= self.cap:
+            return "stages"
+        expected = len(self.stage_s) * min(self.stage_s) * level / next_level  # at least
+        if self.deadline is not None and time.monotonic() + expected > self.deadline:
+            return "budget"
+        return None
+
+    def amount(self, level: int, run: int) -> str:
+        """A level in words."""
+        smc = _lesser(self.config.infer, level).smc
+        return f"{(run + 1) * smc.populations} x {smc.particles} particles"
 
 
-def published(
-    view: View, posterior: Posterior, likelihood: Likelihood, prior: Prior, config: ControllerConfig, seed: int
-) -> Hypotheses:
-    """A posterior as planners read it."""
-    chosen, weights, population = thin(posterior, config.hypotheses)
-    sizeless = without_sizes(likelihood)
-    positions, pose_sigma = posterior.positions[jnp.asarray(chosen)], view.observation.pose_sigma
-    fit = float(weights @ np.asarray(explained(prior.model, sizeless, view.observation, positions), np.float64))
-    cube = view.object_frame
-    if cube.sight_sigma > 0.0:  # what no pixel tells is not sampled: each sample draws it from its prior
-        key = jax.random.fold_in(jax.random.key(seed), 1)
-        drawn = cube.sight_sigma * jax.random.normal(key, posterior.log_weights.shape)
-        camera = jnp.asarray(cube.to_cube(np.zeros(3)), jnp.float32)
-        positions = scaled_about(prior.model, positions, pose_sigma, camera, drawn[jnp.asarray(chosen)])
-    opacity = opacity_grids(prior.model, sizeless, positions, pose_sigma, grid=config.grid)
-    pose = poses(prior.model, sizeless, positions, pose_sigma)
-    d = posterior.diagnostics
-    draft = Hypotheses(
-        stamp_ns=view.frame.stamp_ns,
-        frame_id=view.frame.frame_id,
-        object_id=view.segment.id,
-        label="",
-        object_frame=view.object_frame,
-        T_world_camera=view.frame.T_world_camera,
-        opacity=np.asarray(opacity),
-        pose=np.stack([np.asarray(a) for a in (pose.yaw, pose.x, pose.y, pose.log_scale, pose.z)], axis=-1),
-        weights=weights,
-        population=population,
-        seen=view.seen,
-        inside_view=_inside_picture(view.segment),
-        out_of_model=fit < config.out_of_model_below,
-        stage=int(d.stages),
-        monte_carlo_error=0.0,
-        prior_hash=prior.hash,
-        seed=seed,
-        diagnostics={
-            "acceptance": float(d.acceptance),
-            "divergences": float(d.divergences),
-            "r_hat": float(d.r_hat),
-            "ess": float(d.ess),
-            "ancestors": float(d.ancestors),
-            "beta": float(d.beta.min()),
-            "log_evidence": float(posterior.log_evidence),
-            "log_evidence_se": float(posterior.log_evidence_se),
-            "point_gradients": float(d.point_gradients) * crossings_of(likelihood, view.observation),
-            "explained": fit,
-            "power": likelihood.power,
-            "evidence_power": config.infer.smc.evidence_power,
-        },
-        result=posterior.result,
-    )
-    return _with_error(draft)
-
-
-def _with_error(h: Hypotheses) -> Hypotheses:
-    """Fill in the standard error of the mean occupancy of unseen voxels above the plane."""
-    z = -1.0 + (np.arange(h.grid) + 0.5) * 2.0 / h.grid
-    hidden = ~h.seen & (z > BASE_Z)
-    # one shape at a time: to index them all at once would stop every other thread for a fifth of a second
-    count = np.array([np.count_nonzero(shape & hidden) for shape in h.solid])
-    return replace(h, monte_carlo_error=float(h.estimate(count / max(hidden.sum(), 1))[1]))
-
-
-def _inside_picture(segment: Segment) -> bool:
-    border = np.concatenate([segment.mask[0], segment.mask[-1], segment.mask[:, 0], segment.mask[:, -1]])
-    return not bool(border.any())
+def _lesser(config: InferConfig, level: int) -> InferConfig:
+    return replace(config, smc=replace(config.smc, particles=max(2, config.smc.particles // level)))
 
 
 def crop(frame: Frame, segment: Segment, cube: ObjectFrame, size: int) -> Picture:

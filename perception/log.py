@@ -267,6 +267,7 @@ def _open_cut(paths: list[Path]) -> tuple[_Read, dict[str, str], list[str]]:
     """The same for MCAP files that the indexed reader refuses, read from the front for as long as they last."""
 
     def records(path: Path) -> Iterator[tuple[str, str, Message]]:
+        """Topic, type and message of every record of one file that is whole."""
         schemas: dict[int, str] = {}
         channels: dict[int, tuple[str, str]] = {}
         with path.open("rb") as stream:

@@ -109,7 +109,11 @@ def observe(
     # Half of the free rays pass close to the object: they bound its outline.
     focal = frame.camera.K[0, 0]
     band = config.outline_band * cube.half_extent * focal / np.linalg.norm(cube.T_camera_object[:3, 3])
-    close = (ndimage.distance_transform_edt(~segment.mask) <= band).ravel()[flat]
+    (box,) = ndimage.find_objects(segment.mask.astype(np.int8))
+    part = tuple(slice(min(a.start, b.start), max(a.stop, b.stop)) for a, b in zip(window, box, strict=True))
+    close = np.zeros_like(segment.mask)
+    close[part] = ndimage.distance_transform_edt(~segment.mask[part]) <= band
+    close = close.ravel()[flat]
     free = usable & (status == FREE)
     near = _spread(pixels, np.flatnonzero(free & close), config.free_rays // 2, rng)
     rest = np.setdiff1d(np.flatnonzero(free), near)
@@ -197,8 +201,9 @@ def object_frame(frame: Frame, segment: Segment, config: ObserveConfig) -> Objec
     extra = config.hidden_sigma * float((hidden & outline).sum() / outline.sum())
     if frame.depth is None:
         return _outlined_frame(frame.camera, segment, hidden, extra, config)
-    points = backproject(frame)
-    core = (segment.status == OBJECT) & np.isfinite(points[..., 2])
+    (box,) = ndimage.find_objects(segment.mask.astype(np.int8))  # all of the object is in it
+    points, mask, hidden = backproject(frame)[box], segment.mask[box], hidden[box]
+    core = (segment.status[box] == OBJECT) & np.isfinite(points[..., 2])
     if core.sum() < 10:
         raise ValueError(
             f"object {segment.id} has depth in {core.sum()} pixels inside its outline; move the camera nearer"
@@ -206,7 +211,7 @@ def object_frame(frame: Frame, segment: Segment, config: ObserveConfig) -> Objec
     # The rim counts here, where its depth continues the object's: it is wide on surfaces seen at a grazing angle.
     row, column = ndimage.distance_transform_edt(~core, return_distances=False, return_indices=True)
     with np.errstate(invalid="ignore"):
-        core |= segment.mask & (np.linalg.norm(points - points[row, column], axis=-1) < config.rim_reach)
+        core |= mask & (np.linalg.norm(points - points[row, column], axis=-1) < config.rim_reach)
     core &= heights(points, segment.plane) > 0.0
     thin = max(1, core.sum() // 10_000)
     cloud = points[core][::thin]

@@ -14,15 +14,17 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from perception.controller import ControllerConfig, Estimate, View, infer_view
+from perception.controller import ControllerConfig, Estimate, infer_view
 from perception.hypotheses import Hypotheses
 from perception.observe import ObjectFrame, object_frame, observe
+from perception.publish import View
 from perception.seen import seen_voxels
 from perception.segment import Segment
 from perception.source import Frame
 from probnerf.hmc import StageInfo
-from probnerf.infer import explained, likelihood_of, thin, without_sizes
+from probnerf.infer import explained, likelihood_of, without_sizes
 from probnerf.occupancy import voxel_centres
+from probnerf.populations import thin
 from probnerf.store import Prior
 from probnerf.types import BASE_Z, Observation, Posterior, joined
 

@@ -81,7 +81,7 @@ def test_a_files_trouble_names_the_file(tmp_path: Path) -> None:
 
 def test_the_launch_file_states_the_defaults() -> None:
     loaded = load_config(LAUNCH / "replay.yaml", ReplayConfig)
-    assert loaded.budget == 60.0 and loaded != ReplayConfig()
+    assert loaded.budget == 90.0 and loaded != ReplayConfig()
     assert replace(loaded, budget=None, controller=ReplayConfig().controller) == ReplayConfig()
     assert loaded.controller == ReplayConfig().controller
 

@@ -28,7 +28,9 @@ def _tracker(monkeypatch: pytest.MonkeyPatch, outcome: str | Exception) -> tuple
     return Tracker(Prior(ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {}, "x"), seed=3), asked
 
 
-def test_another_tracker_of_the_same_settings_looks_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_tracker_of_the_same_settings_looks_at_every_level_and_once_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     tracker, asked = _tracker(monkeypatch, "stages")
     before = gc.get_freeze_count()
     try:
@@ -36,9 +38,11 @@ def test_another_tracker_of_the_same_settings_looks_twice(monkeypatch: pytest.Mo
         assert gc.get_freeze_count() > before  # what is there is no longer looked through
     finally:
         gc.unfreeze()
-    assert len(asked) == 2 and asked[0] is asked[1] is not tracker
-    assert asked[0].prior is tracker.prior and asked[0].seed == 3
-    assert asked[0]._tracks is not tracker._tracks and asked[0]._names is not tracker._names
+    assert [trial.config.levels for trial in asked] == [(1,), (1,)] and asked[0] is asked[1]
+    for trial in asked:
+        assert trial is not tracker and trial.prior is tracker.prior and trial.seed == 3
+        assert replace(trial.config, levels=tracker.config.levels) == tracker.config
+        assert trial._tracks is not tracker._tracks and trial._names is not tracker._names
 
 
 def test_a_ctrl_c_that_the_sampler_took_is_passed_on(monkeypatch: pytest.MonkeyPatch) -> None:
