@@ -19,32 +19,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchmarks.rivals import METHODS, POSTERIOR, Answer, RivalConfig, answers, warm_up
+from benchmarks.rivals import METHODS, POSTERIOR, RivalConfig, answers, warm_up
 from benchmarks.rows import Row
-from benchmarks.scene import HiddenVessel, base_rate, hidden_vessel
+from benchmarks.scene import VesselView, base_rate, hidden_vessel
+from benchmarks.score import BOXES, Answer, random_boxes, score
 from benchmarks.summary import interval, mean_rows, say, table
 from perception.controller import ControllerConfig
 from probnerf.families.tabletop import TEST_SEEDS
-from probnerf.metrics import (
-    coverage,
-    falsely_free,
-    hidden_brier,
-    hidden_ece,
-    hidden_nll,
-    ks_distance,
-    paired_interval,
-    randomised_rank,
-    scored_voxels,
-    smooth_probability,
-)
+from probnerf.metrics import coverage, falsely_free, ks_distance, paired_interval, scored_voxels
 from probnerf.store import load_prior
 
 CONDITION = "handle hidden, RGB-D"
-BOXES = 16  # random unseen boxes per vessel
 PER_OBJECT = ("hidden_nll", "hidden_nll_handle", "hidden_brier", "hidden_ece", "seconds")
 COLOURS = dict(zip(METHODS, ("tab:blue", "tab:gray", "tab:orange", "tab:red"), strict=True))
 
@@ -53,7 +42,7 @@ COLOURS = dict(zip(METHODS, ("tab:blue", "tab:gray", "tab:orange", "tab:red"), s
 class Judged:
     """One vessel, every method's answer and their figures."""
 
-    vessel: HiddenVessel
+    vessel: VesselView
     scored: Bool[np.ndarray, "32 32 32"]
     probability: dict[str, Float[np.ndarray, "32 32 32"]]  # smoothed
     values: dict[str, dict[str, float]]  # by method and metric
@@ -63,49 +52,27 @@ class Judged:
     result: str
 
 
-def random_boxes(
-    scored: Bool[np.ndarray, "G G G"], count: int, rng: np.random.Generator
-) -> Int[np.ndarray, "count 2 3"]:
-    """Boxes [low, high) in voxels: a random scored voxel in the middle, sides of 2 to 10 voxels."""
-    middles = rng.choice(np.argwhere(scored), count)
-    sides = rng.integers(2, 11, (count, 3))
-    low = np.maximum(middles - sides // 2, 0)
-    return np.stack([low, np.minimum(low + sides, len(scored))], axis=1)
-
-
 def judge(
-    vessel: HiddenVessel, given: dict[str, Answer], rate: Float[np.ndarray, "32 32 32"], seed: int, warm: bool
+    vessel: VesselView, given: dict[str, Answer], rate: Float[np.ndarray, "32 32 32"], seed: int, warm: bool
 ) -> Judged:
     """Every measure of every method on one vessel; `warm` where their times hold no compilation."""
     scored = scored_voxels(vessel.seen, rate)
-    handle = scored & vessel.near_handle
     rng = np.random.default_rng([seed, vessel.seed, 31])
     boxes = random_boxes(scored, BOXES, rng)
-    hidden = [~vessel.seen[x:a, y:b, z:c] for (x, y, z), (a, b, c) in boxes]
-
-    def volumes(shape: Bool[np.ndarray, "... 32 32 32"]) -> Int[np.ndarray, "boxes ..."]:
-        regions = [shape[..., x:a, y:b, z:c] for (x, y, z), (a, b, c) in boxes]
-        return np.stack([(r & h).sum(axis=(-3, -2, -1)) for r, h in zip(regions, hidden, strict=True)])
-
-    truth = volumes(vessel.solid)
-    values, probability, ranks, p_free = {}, {}, {}, {}
-    for method, answer in given.items():
-        p = answer.p_occupied
-        q = smooth_probability(p, rate)
-        values[method] = {
-            "hidden_nll": hidden_nll(p, rate, vessel.solid, scored),
-            "hidden_nll_handle": hidden_nll(p, rate, vessel.solid, handle),
-            "hidden_brier": hidden_brier(q, vessel.solid, scored),
-            "hidden_ece": hidden_ece(q, vessel.solid, scored),
-            "seconds": answer.seconds if warm else float("nan"),
-        }
-        guessed = volumes(answer.shapes)
-        probability[method] = q
-        ranks[method] = np.array(
-            [randomised_rank(v, answer.weights, float(y), rng) for v, y in zip(guessed, truth, strict=True)]
-        )
-        p_free[method] = (guessed == 0) @ answer.weights
-    return Judged(vessel, scored, probability, values, ranks, p_free, truth > 0, given[POSTERIOR].result)
+    found = {method: score(vessel, answer, rate, boxes, rng) for method, answer in given.items()}
+    return Judged(
+        vessel=vessel,
+        scored=scored,
+        probability={method: s.probability for method, s in found.items()},
+        values={
+            method: {**s.values, "seconds": given[method].seconds if warm else float("nan")}
+            for method, s in found.items()
+        },
+        ranks={method: s.ranks for method, s in found.items()},
+        p_free={method: s.p_free for method, s in found.items()},
+        occupied=found[POSTERIOR].occupied,
+        result=given[POSTERIOR].result,
+    )
 
 
 def main(

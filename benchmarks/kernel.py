@@ -5,13 +5,18 @@ timed in turn, round after round, and medians are given: their ratios hold on a 
 
 - operations: two for each multiply-add of the two networks at the crossings that a pixel can tell of, times three
   (forwards, and backwards by inputs and by weights); encodings, compositing and the likelihood's terms are not counted.
+  All crossings are counted, as plain JAX evaluates them, though the kernel passes over colours and gradients of those
+  that say nothing: in sharp shapes nine of ten. In "haze" every one counts, and the share is the machine's work.
 - least_bytes: weights in and their gradient out; what the fused operation has to move. stored_bytes: every layer's
   values at every crossing, which the plain path writes and reads again.
 - share_of_peak: of the machine's single-precision matrix product, 4096 x 4096, in the same rounds.
 - ratio: seconds of the plain path over seconds of the kernel's at equal work: from weights and pose, and from the
   latent code (with the hypernetwork and its gradient, which is JAX's in both).
+- schedule: seconds that the paper's 100 x 100 leapfrog steps of so many chains take at that speed, by arithmetic.
+- exponent: of the time's growth with particles and with rays, fitted over a factor of 16 and of 8; 1 is linear.
 """
 
+import math
 import os
 import time
 from collections.abc import Callable
@@ -55,6 +60,19 @@ class Given(eqx.Module):
         return z_tilde
 
 
+Prior = ProbNeRF | Given
+
+
+class Haze(Given):
+    """A field whose density lets light through: every crossing counts."""
+
+    def decode(self, z_tilde: Float[Array, "w"]) -> Float[Array, "w"]:
+        """Weights of natural size, with little density: an optical depth of 0.04 a face."""
+        last = sum(math.prod(shape) for shape in self.field.shapes[:6]) - 1
+        return (0.5 * z_tilde * self.field.weight_scale).at[last].set(-4.0)
+
+
+CHAINS, SCHEDULE = 8, 100 * 100 + 1  # of the paper: chains, gradients of each
 SIDE = 4096  # of the matrices whose product is the machine's peak
 
 
@@ -72,20 +90,58 @@ def main(out: Path, quick: bool = False, repeats: int = 9) -> list[Row]:
     frame = next(iter(Log(SHIPPED_LOG)))
     view, _ = observe(frame, segment(frame)[0])
     shipped = load_prior().model
-    cases = {"small, 384 particles x 64 rays": (shipped, view, 384)}
+    cases: dict[str, tuple[ProbNeRF | Given, Observation, int]] = {
+        "small, 384 particles x 64 rays": (shipped, view, 384)
+    }
     if not quick:
         cases["small, 8 particles x 512 rays"] = (shipped, joined([view] * 8), 8)
         paper = ProbNeRF(PRESETS["paper"], jax.random.key(0))
         cases["paper, 8 particles x 512 rays"] = (paper, joined([view] * 8), 8)
+        cases["small, haze, 384 particles x 64 rays"] = (Haze(shipped.field), view, 384)
+        cases["paper, haze, 8 particles x 512 rays"] = (Haze(paper.field), joined([view] * 8), 8)
     rows = []
     for condition, (model, observation, particles) in cases.items():
         say(condition)
         rows += _measure(condition, model, observation, particles, repeats)
-    _draw(rows, out / "kernel.png")
+    grown = _growth(shipped, view, repeats)
+    for method, points in grown.items():
+        exponent = float(np.polyfit(np.log([n for n, _ in points]), np.log([t for _, t in points]), 1)[0])
+        rows.append(Row("kernel", "kernel with hypernetwork", method, "exponent", exponent, "", repeats))
+    _draw(rows, grown, out / "kernel.png")
     return rows
 
 
-def _measure(condition: str, model: ProbNeRF, observation: Observation, particles: int, repeats: int) -> list[Row]:
+def _growth(model: ProbNeRF, view: Observation, repeats: int) -> dict[str, list[tuple[int, float]]]:
+    """(number, seconds) of a value and gradient by the number of particles, and of rays."""
+    runs: dict[str, tuple[Callable, Array]] = {}
+    sizes = {"particles, 64 rays": [(n, 1) for n in (48, 96, 192, 384, 768)]}
+    sizes["rays, 96 particles"] = [(96, n) for n in (1, 2, 4, 8)]
+    for condition, each in sizes.items():
+        for particles, views in each:
+            observation = joined([view] * views)
+            likelihood = likelihood_of(InferConfig(), observation)
+            args = (model, likelihood, observation, faces_of_view(observation, likelihood))
+            q = 0.5 * jax.random.normal(jax.random.key(0), (particles, likelihood.dim(model)))
+            runs[f"{condition}: {particles} {views}"] = (_whole(log_likelihood, args), q)
+    seconds = _timed(runs, repeats)
+    rays = view.status.size
+    return {
+        condition: [
+            (
+                particles if condition.startswith("particles") else views * rays,
+                seconds[f"{condition}: {particles} {views}"],
+            )
+            for particles, views in each
+        ]
+        for condition, each in sizes.items()
+    }
+
+
+def _whole(function: Callable, args: tuple) -> Callable:
+    return jax.jit(lambda q: jax.value_and_grad(lambda v: function(args, v).sum())(q))
+
+
+def _measure(condition: str, model: Prior, observation: Observation, particles: int, repeats: int) -> list[Row]:
     likelihood = likelihood_of(InferConfig(), observation)
     t = faces_of_view(observation, likelihood)
     points, coloured = _told(observation, np.asarray(t))
@@ -102,19 +158,19 @@ def _measure(condition: str, model: ProbNeRF, observation: Observation, particle
     given = Given(field)
     matrix = jnp.ones((SIDE, SIDE), jnp.float32)
 
-    def whole(function: Callable, args: tuple) -> Callable:
-        return jax.jit(lambda q: jax.value_and_grad(lambda v: function(args, v).sum())(q))
-
     def kernel(threads: int | None = None, isa: str = "") -> Callable:
-        return jax.jit(lambda w: fused.call(field, likelihood, observation, t, w, pose, threads, isa))
+        return jax.jit(lambda w: fused.call(field, likelihood, observation, t, w, pose, threads=threads, isa=isa))
 
     runs: dict[str, tuple[Callable, Array]] = {
-        "matrix product": (jax.jit(lambda a: a @ a), matrix),
+        "matrix product": (_squared, matrix),
         "kernel": (kernel(), weights),
         "kernel, one thread": (kernel(1), weights),
-        "plain JAX": (whole(plain_log_likelihood, (given, packed, observation, packed_t)), placed),
-        "kernel with hypernetwork": (whole(log_likelihood, (model, likelihood, observation, t)), positions),
-        "plain JAX with hypernetwork": (whole(plain_log_likelihood, (model, packed, observation, packed_t)), positions),
+        "plain JAX": (_whole(plain_log_likelihood, (given, packed, observation, packed_t)), placed),
+        "kernel with hypernetwork": (_whole(log_likelihood, (model, likelihood, observation, t)), positions),
+        "plain JAX with hypernetwork": (
+            _whole(plain_log_likelihood, (model, packed, observation, packed_t)),
+            positions,
+        ),
     }
     for isa in ("avx2", "plain"):
         try:
@@ -139,6 +195,9 @@ def _measure(condition: str, model: ProbNeRF, observation: Observation, particle
     for path in ("", " with hypernetwork"):
         ratio = seconds[f"plain JAX{path}"] / seconds[f"kernel{path}"]
         rows.append(Row("kernel", f"kernel{path}", condition, "ratio", ratio, "", repeats))
+    if particles == CHAINS:
+        for method in ("kernel with hypernetwork", "plain JAX with hypernetwork"):
+            rows.append(Row("kernel", method, condition, "schedule", SCHEDULE * seconds[method], "s", repeats))
     return rows
 
 
@@ -152,6 +211,17 @@ def _timed(runs: dict[str, tuple[Callable, Array]], repeats: int) -> dict[str, f
             if repeat >= 0:
                 taken[name].append(time.perf_counter() - begun)
     return {name: float(np.median(values)) for name, values in taken.items()}
+
+
+def matrix_speed(side: int = SIDE, repeats: int = 3) -> float:
+    """GFLOP/s of the machine's single-precision matrix product, median."""
+    matrix = jnp.ones((side, side), jnp.float32)
+    return 2e-9 * side**3 / _timed({"matrix product": (_squared, matrix)}, repeats)["matrix product"]
+
+
+@jax.jit
+def _squared(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    return matrix @ matrix
 
 
 def _told(observation: Observation, t: np.ndarray) -> tuple[int, int]:
@@ -175,20 +245,27 @@ def _colour_size(field: MLPField) -> int:
     return (encoded_size(field.octaves, 3 + field.radial) + 1) * h + h * h + 3 * h
 
 
-def _draw(rows: list[Row], path: Path) -> None:
-    """Shares of the peak, by path and case."""
+def _draw(rows: list[Row], grown: dict[str, list[tuple[int, float]]], path: Path) -> None:
+    """Shares of the peak, by path and case; time by particles and by rays."""
     shares = [row for row in rows if row.metric == "share_of_peak"]
     conditions = list(dict.fromkeys(row.condition for row in shares))
     methods = list(dict.fromkeys(row.method for row in shares))
-    figure = Figure(figsize=(8, 1.2 + 0.22 * len(shares)), layout="constrained")
-    ax = figure.subplots()
+    figure = Figure(figsize=(13, 1.2 + 0.22 * len(shares)), layout="constrained")
+    ax, growth = figure.subplots(1, 2, width_ratios=(2, 1))
+    for condition, points in grown.items():
+        growth.loglog(*zip(*points, strict=True), "o-", label=condition)
+    n = np.array([32, 1024])
+    growth.loglog(n, n * min(t / k for points in grown.values() for k, t in points), "k--", linewidth=1, label="linear")
+    growth.set(xlabel="number", ylabel="seconds a value and gradient")
+    growth.legend(fontsize=8)
     for i, condition in enumerate(conditions):
         there = [row for row in shares if row.condition == condition]
         at = [methods.index(row.method) + 0.8 * (i - (len(conditions) - 1) / 2) / len(conditions) for row in there]
         ax.barh(at, [100 * row.value for row in there], height=0.8 / len(conditions), label=condition)
     ax.set_yticks(range(len(methods)), methods)
     ax.invert_yaxis()
-    ax.set(xlabel=f"share of the machine's matrix product, % ({os.cpu_count()} cores)", xlim=(0, 100))
+    ax.axvline(100.0, color="k", linewidth=0.7)
+    ax.set(xlabel=f"operations of plain JAX over the machine's matrix product, % ({os.cpu_count()} cores)")
     ax.legend(fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)

@@ -35,7 +35,7 @@ from probnerf.families.render import handle_occupancy, look_at, pinhole_rays, so
 from probnerf.families.tabletop import TEST_SEEDS, TabletopObject, sample_object
 from probnerf.infer import opacity_grids
 from probnerf.metrics import iou, psnr, recall
-from probnerf.model import Likelihood, pixel_terms
+from probnerf.model import Likelihood, log_likelihood
 from probnerf.occupancy import coarsen, solid
 from probnerf.prior import ProbNeRF
 from probnerf.store import load_prior
@@ -172,12 +172,12 @@ def _batches(seen: SeenObject, config: GateConfig) -> Observation:
     )
 
 
-def _log_posterior(args: tuple, batch: Observation, z_tilde: Float[Array, "1 k"]) -> Float[Array, "1"]:
+def _log_posterior(args: tuple, batch: Observation, z_tilde: Float[Array, "p k"]) -> Float[Array, "p"]:
     """counted times the mean pixel log-likelihood, plus the log prior."""
     model, likelihood, counted = args
     t = foam.crossings(batch.rays, likelihood.lattice)
-    terms = pixel_terms(model.field, model.decode(z_tilde[0]), None, likelihood, batch, t)
-    return (counted * jnp.mean(terms) - 0.5 * jnp.sum(z_tilde**2))[None]
+    mean = log_likelihood((model, likelihood, batch, t), z_tilde) / len(batch.status)
+    return counted * mean - 0.5 * jnp.sum(z_tilde**2, axis=-1)
 
 
 @partial(jax.jit, static_argnames="lattice")
@@ -222,7 +222,9 @@ def rebuild(model: ProbNeRF, seed: int, config: GateConfig) -> Rebuilt:
     rendered = render_pixels(model, z[0], seen, np.concatenate(boxes), config)
     parts = np.split(rendered, np.cumsum([len(b) for b in boxes])[:-1])
     truth = seen.rgb.reshape(-1, 3)
-    occupied = solid(np.asarray(opacity_grids(model, config.likelihood, z, jnp.zeros(5), grid=GRID))[0])
+    occupied = solid(
+        np.asarray(opacity_grids(model, config.likelihood, z, jnp.zeros(5), jnp.ones((GRID,) * 3, bool)))[0]
+    )
     true_solid = solid(np.asarray(solid_occupancy(seen.truth, GRID), np.float32))
     return Rebuilt(
         seen=seen,

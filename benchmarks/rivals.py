@@ -1,16 +1,18 @@
 """Answers to one view: the posterior, and what it must beat: prior alone, encoder alone, one MAP shape."""
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from benchmarks.scene import GRID, HiddenVessel
+from benchmarks.scene import GRID, VesselView
+from benchmarks.score import Answer
 from perception.controller import ControllerConfig, crop, estimate
 from perception.observe import observe
+from perception.seen import answered_voxels
 from perception.segment import Segment
 from perception.source import Frame
 from probnerf.baselines.map import MAPConfig, map_estimate
@@ -25,20 +27,6 @@ from probnerf.types import Observation, Pose
 POSTERIOR, PRIOR, ENCODER, MAP = METHODS = ("tempered_smc", "prior alone", "encoder alone", "map")
 
 
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """Weighted solid shapes of one method, and what they cost."""
-
-    shapes: Bool[np.ndarray, "S 32 32 32"]
-    weights: Float[np.ndarray, "S"]
-    seconds: float
-    result: str = ""  # why the sampler stopped
-
-    @property
-    def p_occupied(self) -> Float[np.ndarray, "32 32 32"]:
-        return np.tensordot(self.weights, self.shapes, 1)
-
-
 @dataclass(frozen=True)
 class RivalConfig:
     """Sizes of the rivals; the posterior's are the controller's own."""
@@ -49,7 +37,7 @@ class RivalConfig:
 
 
 def answers(
-    vessel: HiddenVessel,
+    vessel: VesselView,
     prior: Prior,
     config: ControllerConfig,
     rivals: RivalConfig,
@@ -66,9 +54,10 @@ def answers(
     likelihood = likelihood_of(config.infer, observation)
     model, key = prior.model, jax.random.key(seed)
     dim = likelihood.dim(model)
+    asked = jnp.asarray(answered_voxels(vessel.frame, vessel.segment, cube, config.grid))
 
     def answer(positions: Array, weights: np.ndarray, begun: float) -> Answer:
-        opacity = opacity_grids(model, likelihood, positions, observation.pose_sigma, grid=config.grid)
+        opacity = opacity_grids(model, likelihood, positions, observation.pose_sigma, asked)
         shapes = coarsen(solid(np.asarray(opacity)), GRID)
         return Answer(shapes, weights, time.monotonic() - begun)
 
@@ -93,7 +82,8 @@ def warm_up(
     likelihood = likelihood_of(config.infer, observation)
     size = (likelihood.lattice.crossings, *likelihood.packed)
     if size not in sizes:
-        estimate(frame, segment, prior, config, stages=1)
+        for level in config.levels:
+            estimate(frame, segment, prior, replace(config, levels=(level,)), stages=1)
         sizes.add(size)
 
 

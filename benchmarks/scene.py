@@ -1,7 +1,8 @@
-"""Hidden handles: vessels on a simulated table whose handle no pixel shows, with the truth in the view frame."""
+"""Vessels on a simulated table whose handle no pixel shows, or many do, with the truth in the view frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +33,7 @@ FINE = 64  # voxels per axis of the truth, before it is coarsened as the hypothe
 
 @dataclass(frozen=True)
 class ViewConfig:
-    """The simulated camera and where it may stand."""
+    """The simulated camera and where it may stand, and when a view shows the handle."""
 
     width: int = 640  # px
     height: int = 480  # px
@@ -42,16 +43,39 @@ class ViewConfig:
     nearest: float = 3.5  # and at least so many half extents of the object
     aim: float = 0.02  # m; standard deviation of where the camera looks about the object's middle
     tries: int = 60  # placements drawn for a vessel before the next one is taken
+    least: int = 500  # px of the object that a hidden handle's view has
+    shown: int = 150  # px of the handle in an informative view,
+    shown_share: float = 0.04  # and at least so much of the object's pixels
+
+
+Handle = Literal["hidden", "informative"]  # no pixel shows the handle; it shows clearly (`ViewConfig.shown`)
 
 
 @dataclass(frozen=True, eq=False)
-class HiddenVessel:
-    """One view in which the handle is hidden, and what is there. Grids are [i_x, i_y, i_z] over the view's cube."""
+class VesselPicture:
+    """A vessel on the table and a camera that stands as was asked for, before any sensor."""
+
+    placed: Placed
+    camera: Camera
+    T_world_camera: Float[np.ndarray, "4 4"]
+    picture: Picture  # faultless
+
+    @property
+    def T_camera_object(self) -> Float[np.ndarray, "4 4"]:
+        """The canonical object frame in the camera's, metres."""
+        return truth(Scene((self.placed,)), self.T_world_camera)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class VesselView:
+    """A view of a vessel as perception takes it, and what is there. Grids are [i_x, i_y, i_z] over the view's cube."""
 
     seed: int
     frame: Frame  # with the sensor's faults, and the true mask as label 1
     segment: Segment
     cube: ObjectFrame
+    shape: TabletopObject
+    T_canonical_view: Float[np.ndarray, "4 4"]  # affine: from the view's cube to the shape's, cube units both
     solid: Bool[np.ndarray, "32 32 32"]
     seen: Bool[np.ndarray, "32 32 32"]  # by the true geometry
     near_handle: Bool[
@@ -59,57 +83,78 @@ class HiddenVessel:
     ]  # outside the body, where the true handle passes as it turns about the axis
 
 
-def hidden_vessel(seed: int, config: ViewConfig | None = None) -> HiddenVessel | None:
-    """The vessel of a family seed in a view that does not show its handle, or None.
-
-    None: no handle, none hidden in `tries` draws of yaw and camera, or outside perception's range of sizes. The view is
-    the first of independent draws (uniform yaw, elevation and distance) in which no pixel shows the handle.
+def vessel_picture(seed: int, handle: Handle, config: ViewConfig | None = None) -> VesselPicture | None:
+    """The vessel of a family seed in the first of independent draws (uniform yaw, elevation and distance) in which its
+    handle is hidden or shows, as asked for; None if it has none, or `tries` draws hold no such view.
     """
     config = config or ViewConfig()
     shape = Placed(seed, 0.0, 0.0, 0.0).shape
     if not bool(shape.has_handle):
         return None
     rng = np.random.default_rng([seed, 23])
-    camera = Camera(
-        config.width,
-        config.height,
-        np.array([[config.focal, 0, config.width / 2], [0, config.focal, config.height / 2], [0, 0, 1]]),
-        np.zeros(5),
-    )
+    camera = simulated_camera(config)
     for _ in range(config.tries):
-        placed, T_world_camera = _place(seed, rng, config)
+        placed, T_world_camera = place(seed, rng, config)
         T_object_camera = np.linalg.inv(placed.T_world_object) @ T_world_camera
         T_object_camera[:3, 3] /= placed.half_extent
-        if _shows_handle(shape, T_object_camera):
+        if _shows_handle(shape, T_object_camera) != (handle == "informative"):  # a small picture costs less
             continue
-        scene = Scene((placed,))
-        picture = render(scene, camera, T_world_camera)
-        T_camera_object = truth(scene, T_world_camera)[0]
-        if (picture.label == 1).sum() < 500 or _pixels_of_handle(picture, camera, T_camera_object, placed):
-            continue
-        frame = sense(picture, camera, T_world_camera, seed)
-        try:
-            found = segment(frame, 1)[0]
-            cube = object_frame(frame, found, ObserveConfig())
-        except ValueError:
-            return None
-        faultless = Frame(0, frame.frame_id, frame.rgb, picture.depth.astype(np.float32), None, camera)
-        T_canonical_view = _affine(cube, T_camera_object, placed.half_extent)
-        body, handle = (np.asarray(a) for a in _parts(shape, T_canonical_view, FINE))
-        swept = np.asarray(_swept(shape, T_canonical_view, GRID))
-        return HiddenVessel(
-            seed=seed,
-            frame=frame,
-            segment=found,
-            cube=cube,
-            solid=coarsen(solid((body | handle).astype(np.float32)), GRID),
-            seen=seen_voxels(faultless, found, cube, GRID),
-            near_handle=swept & ~coarsen(body, GRID),
-        )
+        view = VesselPicture(placed, camera, T_world_camera, render(Scene((placed,)), camera, T_world_camera))
+        pixels, total = _pixels_of_handle(view), int((view.picture.label == 1).sum())
+        if handle == "hidden" and total >= config.least and not pixels:
+            return view
+        if handle == "informative" and pixels >= max(config.shown, config.shown_share * total):
+            return view
     return None
 
 
-def _place(seed: int, rng: np.random.Generator, config: ViewConfig) -> tuple[Placed, Float[np.ndarray, "4 4"]]:
+def vessel_view(picture: VesselPicture, depth: bool = True) -> VesselView:
+    """What perception makes of a picture through a faulty sensor, with the truth in the cube that it chose.
+
+    Without `depth` the segment is the true mask's, on the plane that the camera's pose over the table gives (with
+    `PlaneGuess`'s errors of it): what a user has to say of a picture. Raises ValueError where perception refuses.
+    """
+    placed, camera, seed = picture.placed, picture.camera, picture.placed.seed
+    frame = sense(picture.picture, camera, picture.T_world_camera, seed)
+    frame = frame if depth else replace(frame, depth=None)
+    found = segment(frame, 1)[0]
+    cube = object_frame(frame, found, ObserveConfig())
+    faultless = Frame(0, frame.frame_id, frame.rgb, picture.picture.depth.astype(np.float32), None, camera)
+    T_canonical_view = _affine(cube, picture.T_camera_object, placed.half_extent)
+    body, handle = (np.asarray(a) for a in _parts(placed.shape, T_canonical_view, FINE))
+    swept = np.asarray(_swept(placed.shape, T_canonical_view, GRID))
+    return VesselView(
+        seed=seed,
+        frame=frame,
+        segment=found,
+        cube=cube,
+        shape=placed.shape,
+        T_canonical_view=T_canonical_view,
+        solid=coarsen(solid((body | handle).astype(np.float32)), GRID),
+        seen=seen_voxels(faultless, found, cube, GRID),
+        near_handle=swept & ~coarsen(body, GRID),
+    )
+
+
+def hidden_vessel(seed: int, config: ViewConfig | None = None) -> VesselView | None:
+    """The vessel of a family seed in an RGB-D view that does not show its handle.
+
+    None: no handle, none hidden in `tries` draws of yaw and camera, or outside perception's range of sizes.
+    """
+    picture = vessel_picture(seed, "hidden", config)
+    try:
+        return None if picture is None else vessel_view(picture)
+    except ValueError:
+        return None
+
+
+def simulated_camera(config: ViewConfig) -> Camera:
+    """A pinhole camera without distortion."""
+    K = np.array([[config.focal, 0, config.width / 2], [0, config.focal, config.height / 2], [0, 0, 1]])
+    return Camera(config.width, config.height, K, np.zeros(5))
+
+
+def place(seed: int, rng: np.random.Generator, config: ViewConfig) -> tuple[Placed, Float[np.ndarray, "4 4"]]:
     """A random placement and T_world_camera."""
     placed = Placed(seed, rng.uniform(-0.05, 0.05), rng.uniform(-0.05, 0.05), rng.uniform(-np.pi, np.pi))
     middle = placed.T_world_object[:3, 3]
@@ -128,15 +173,14 @@ def _shows_handle(obj: TabletopObject, T_object_camera: Float[np.ndarray, "4 4"]
     return bool(np.any(_on_handle(obj, origin + np.where(hit, length, 0.0)[:, None] * direction)[hit]))
 
 
-def _pixels_of_handle(
-    picture: Picture, camera: Camera, T_camera_object: Float[np.ndarray, "4 4"], placed: Placed
-) -> int:
+def _pixels_of_handle(view: VesselPicture) -> int:
     """How many pixels of the faultless picture show the handle."""
-    v, u = np.nonzero(picture.label == 1)
-    rays = camera.rays(np.column_stack([u, v]))
-    points = rays / rays[:, 2:] * picture.depth[v, u][:, None]
-    points = (points - T_camera_object[:3, 3]) @ T_camera_object[:3, :3] / placed.half_extent
-    return int(_on_handle(placed.shape, points.astype(np.float32)).sum())
+    v, u = np.nonzero(view.picture.label == 1)
+    rays = view.camera.rays(np.column_stack([u, v]))
+    points = rays / rays[:, 2:] * view.picture.depth[v, u][:, None]
+    T = view.T_camera_object
+    points = (points - T[:3, 3]) @ T[:3, :3] / view.placed.half_extent
+    return int(_on_handle(view.placed.shape, points.astype(np.float32)).sum())
 
 
 def _on_handle(obj: TabletopObject, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:

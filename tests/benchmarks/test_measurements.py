@@ -13,10 +13,11 @@ from benchmarks.frame import (
     read_truth,
     weighted_median,
 )
-from benchmarks.hidden import judge, random_boxes
+from benchmarks.hidden import judge
 from benchmarks.prior import VIEWS, see
-from benchmarks.rivals import METHODS, POSTERIOR, Answer
+from benchmarks.rivals import METHODS, POSTERIOR
 from benchmarks.scene import base_rate, hidden_vessel
+from benchmarks.score import Answer, random_boxes
 from benchmarks.summary import mean_rows
 from perception.plane import heights
 from perception.segment import segment

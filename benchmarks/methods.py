@@ -1,0 +1,292 @@
+"""The methods that `farside bench frontier` compares: a table, and one answer from frame to grids, timed.
+
+Seconds are of one object, from the frame to its solid grids, compiled before. The cost that no machine changes is
+point_gradients, evaluations of the field with its gradient: gradients of whole positions x crossings of the view (also
+of those whose gradient the kernel leaves out because they say nothing, for every method alike). The encoder alone takes
+none, only evaluations; starts of the sampler are evaluated as well, which only seconds count. All methods are given the
+same pixels, likelihood and prior.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from benchmarks.rivals import RivalConfig, encoder_alone, encoder_positions
+from benchmarks.scene import GRID, VesselView
+from benchmarks.score import Answer
+from perception.controller import ControllerConfig, crop, estimate
+from perception.observe import ObjectFrame, observe
+from perception.seen import answered_voxels
+from probnerf.baselines.map import log_posterior, map_estimate
+from probnerf.baselines.vi import VIConfig, mean_field
+from probnerf.hmc import AnnealedHMCConfig
+from probnerf.infer import crossings_of, infer, likelihood_of, opacity_grids, scaled_about, without_sizes
+from probnerf.model import Likelihood, faces_of_view, log_likelihood
+from probnerf.occupancy import coarsen, solid
+from probnerf.populations import thin
+from probnerf.proposal import Picture
+from probnerf.store import Prior
+from probnerf.types import Diagnostics, Observation, Posterior
+
+DEPTHS = ("RGB-D", "colour only")
+CONDITIONS = tuple(f"{handle}, {depth}" for handle in ("hidden", "informative") for depth in DEPTHS)
+WITH_DEPTH = tuple(c for c in CONDITIONS if c.endswith(DEPTHS[0]))
+TELLING = CONDITIONS[:1]  # where the slowest and the levers are compared
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """One view, and all else that an answer depends on."""
+
+    view: VesselView
+    prior: Prior
+    config: ControllerConfig
+    seed: int
+
+    @cached_property
+    def observed(self) -> tuple[Observation, ObjectFrame]:
+        return observe(self.view.frame, self.view.segment, self.config.observe, self.seed)
+
+    @property
+    def key(self) -> Array:
+        return jax.random.key(self.seed)
+
+    @cached_property
+    def likelihood(self) -> Likelihood:
+        return likelihood_of(self.config.infer, self.observed[0])
+
+    @property
+    def arguments(self) -> tuple:
+        """What `model.log_likelihood` takes."""
+        observation = self.observed[0]
+        return self.prior.model, self.likelihood, observation, faces_of_view(observation, self.likelihood)
+
+    @property
+    def picture(self) -> Picture:
+        """The encoder's; without depth the object is at an unknown range."""
+        frame = self.view.frame
+        if frame.depth is None:
+            frame = replace(frame, depth=np.full(frame.rgb.shape[:2], np.nan, np.float32))
+        return crop(frame, self.view.segment, self.observed[1], self.prior.model.preset.image_size)
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """Weighted positions and their cost."""
+
+    posterior: Posterior
+    observation: Observation
+    likelihood: Likelihood
+    cube: ObjectFrame
+    point_gradients: float
+    point_evaluations: float = 0.0  # of the field alone, where there are no gradients
+    seconds: float | None = None  # up to published grids; None: up to these positions, so that grids are still to come
+
+
+@dataclass(frozen=True)
+class Method:
+    """One row of the table. `sample(question, True)` compiles what `sample(question, False)` needs, at less cost."""
+
+    name: str
+    group: str  # methods that a line joins
+    label: str  # in the chart; a lever's begins with its letter
+    sample: Callable[[Question, bool], Sampled] = field(compare=False)
+    settings: dict[str, Any]  # that make it another method
+    conditions: tuple[str, ...] = CONDITIONS
+    programs: str = ""  # methods that compile the same; "": none
+    smc: bool = False  # whether `InferConfig.smc` matters to it
+
+
+def _weighted(positions: Float[Array, "s d"], weights: Float[np.ndarray, "s"], gradients: float) -> Posterior:
+    """Positions of a method that is no sampler as samples of one population."""
+    nan, zero = jnp.asarray(np.float32("nan")), jnp.zeros((), jnp.int32)
+    with np.errstate(divide="ignore"):
+        log_weights = jnp.asarray(np.log(weights / weights.sum()), jnp.float32)
+    count = len(weights)
+    diagnostics = Diagnostics(
+        nan, zero, nan, nan, zero, zero, jnp.asarray(np.float32(gradients)), jnp.ones(1), jnp.full(1, nan)
+    )
+    values, population = jnp.full(count, nan), jnp.zeros(count, jnp.int32)
+    return Posterior(positions, log_weights, values, population, nan, nan, diagnostics, "")
+
+
+def _sampled(q: Question, posterior: Posterior, evaluations: float = 0.0) -> Sampled:
+    (observation, cube), crossings = q.observed, crossings_of(q.likelihood, q.observed[0])
+    gradients = crossings * float(posterior.diagnostics.point_gradients)
+    return Sampled(posterior, observation, q.likelihood, cube, gradients, crossings * evaluations)
+
+
+def _encoder() -> Method:
+    config = RivalConfig()
+
+    def sample(q: Question, _: bool) -> Sampled:
+        drawn, weights = encoder_alone(q.key, q.prior.model, q.likelihood, q.observed[0], q.picture, config)
+        return _sampled(q, _weighted(drawn, weights, 0.0), evaluations=config.yaws * config.draws)
+
+    return Method("encoder alone", "encoder", "encoder", sample, {"yaws": config.yaws, "draws": config.draws})
+
+
+def _map() -> Method:
+    config = RivalConfig()
+    fit = config.fit
+
+    def sample(q: Question, _: bool) -> Sampled:
+        starts = encoder_positions(q.key, q.prior.model, q.picture, config.yaws, 1, 0.0)
+        best, _ = map_estimate(q.prior.model, q.likelihood, q.observed[0], starts, fit)
+        gradients = config.yaws * fit.screen_steps + fit.survivors * fit.steps
+        return _sampled(q, _weighted(best[None], np.ones(1), gradients), evaluations=config.yaws + fit.survivors)
+
+    return Method("map", "map", "MAP", sample, {"yaws": config.yaws, **asdict(fit)})
+
+
+def _vi(config: VIConfig) -> Method:
+    yaws = RivalConfig().yaws
+
+    def sample(q: Question, _: bool) -> Sampled:
+        args = q.arguments
+        starts = encoder_positions(q.key, q.prior.model, q.picture, yaws, 1, 0.0)
+        at = int(jnp.argmax(jnp.nan_to_num(jax.jit(log_posterior)(args, None, starts), nan=-jnp.inf)))
+        found, _ = mean_field(q.key, log_likelihood, args, starts[at], config)
+        count = q.config.hypotheses
+        noise = jax.random.normal(jax.random.fold_in(q.key, 1), (count, starts.shape[1]))
+        drawn = _weighted(found.draw(noise), np.full(count, 1.0 / count), config.steps * config.draws)
+        return _sampled(q, drawn, evaluations=yaws)
+
+    return Method("vi", "vi", "VI", sample, {"yaws": yaws, **asdict(config)})
+
+
+def _hmc(name: str, group: str, hmc: AnnealedHMCConfig, conditions: tuple[str, ...] = CONDITIONS) -> Method:
+    def sample(q: Question, short: bool) -> Sampled:
+        config = replace(q.config.infer, method="annealed_hmc", hmc=hmc)
+        posterior, _ = infer(q.key, q.prior.model, q.observed[0], config, stages=1 if short else None)
+        return _sampled(q, posterior)
+
+    return Method(f"{name} {_schedule(hmc)}", group, _schedule(hmc), sample, asdict(hmc), conditions)
+
+
+def _schedule(hmc: AnnealedHMCConfig) -> str:
+    return f"{hmc.iterations}x{hmc.leapfrog_steps}"
+
+
+def annealed(iterations: int, leapfrog_steps: int) -> AnnealedHMCConfig:
+    """The paper's schedule, shortened: the same share of its end is kept, at the same temperatures."""
+    keep = max(1, round(0.16 * iterations))
+    return AnnealedHMCConfig(iterations=iterations, leapfrog_steps=leapfrog_steps, keep=keep)
+
+
+def _estimate(
+    name: str,
+    group: str,
+    label: str,
+    *,
+    stages: int | None = None,
+    budget_s: float | None = None,
+    infer: dict[str, Any] | None = None,
+    smc: dict[str, Any] | None = None,
+    levels: tuple[int, ...] | None = (1,),
+    runs: int = 1,
+    conditions: tuple[str, ...] = CONDITIONS,
+) -> Method:
+    """Perception's own way, with other numbers of `InferConfig` and of its `smc`.
+
+    `runs` at the last of fixed `levels`, or with None the controller's own choice.
+    """
+
+    def sample(q: Question, short: bool) -> Sampled:
+        """Perception's answer; a short one goes through every level that the method may use."""
+        sampler = replace(q.config.infer, **(infer or {}), smc=replace(q.config.infer.smc, **(smc or {})))
+        limits = {"stages": None if stages is None else 2} if short else {"stages": stages, "budget_s": budget_s}
+        config = replace(q.config, infer=sampler)
+        if levels is not None:
+            config = replace(config, levels=levels, runs=runs, unexplained=1.0, tolerance=0.0)
+        elif short:
+            config = replace(config, runs=1, tolerance=0.0)  # through all levels
+        begun = time.monotonic()
+        found = estimate(q.view.frame, q.view.segment, q.prior, config, seed=q.seed, **limits)
+        seconds = time.monotonic() - begun
+        gradients = found.hypotheses.diagnostics["point_gradients"]
+        cube, likelihood = found.object_frame, found.likelihood
+        return Sampled(found.posterior, found.observation, likelihood, cube, float(gradients), seconds=seconds)
+
+    fixed = ControllerConfig() if levels is None else ControllerConfig(levels=levels, runs=runs)
+    amount = {"levels": list(fixed.levels), "runs": fixed.runs}
+    if levels is None:
+        amount |= {"unexplained": fixed.unexplained, "tolerance": fixed.tolerance}
+    settings = {"stages": stages, "budget_s": budget_s, **amount, **(infer or {}), **(smc or {})}
+    programs = "" if budget_s is None else group  # one budget compiles what another needs
+    return Method(name, group, label, sample, settings, conditions, programs, smc=True)
+
+
+FULL = "paper 100x100"  # the paper's own schedule; it takes long
+METHODS = (
+    _encoder(),
+    _map(),
+    _vi(VIConfig()),
+    _hmc("paper", "paper", annealed(10, 10)),
+    _hmc("paper", "paper", annealed(20, 20)),
+    _hmc("paper", "paper", annealed(50, 50), WITH_DEPTH),
+    _hmc("paper", "paper", annealed(100, 100), TELLING),
+    _hmc("fixed", "fixed temperature", replace(annealed(20, 100), s_start=0.1), TELLING),
+    _estimate("smc", "smc", "x1", stages=60),
+    _estimate("smc, 2 runs", "smc", "x2", stages=120, runs=2, conditions=TELLING),
+    _estimate("smc, smallest level", "smallest level", "x1", stages=60, levels=(3,)),
+    _estimate("smc, smallest level, 4 runs", "smallest level", "x4", stages=240, levels=(3,), runs=4),
+    _estimate(
+        "smc, no encoder",
+        "lever off",
+        "E no encoder starts",
+        stages=60,
+        infer={"encoder_starts": False},
+        conditions=TELLING,
+    ),
+    _estimate(
+        "smc, one move", "lever off", "O one move a beta", stages=60, smc={"least_moved": 0.0}, conditions=TELLING
+    ),
+    _estimate("smc, lattice 16", "lever off", "C coarse lattice", stages=60, infer={"lattice": 16}, conditions=TELLING),
+    _estimate("smc, power 0.5", "lever off", "K power 0.5", stages=60, infer={"power": 0.5}, conditions=TELLING),
+    _estimate("smc, no metric", "lever off", "M prior's metric", stages=60, smc={"metric": False}, conditions=TELLING),
+    _estimate(
+        "smc, 6 leapfrog steps",
+        "lever off",
+        "L 6 leapfrog steps",
+        stages=60,
+        smc={"leapfrog_steps": 6},
+        conditions=TELLING,
+    ),
+    *(
+        _estimate(f"controller {s:g} s", "controller", f"{s:g} s", budget_s=s, levels=None)
+        for s in (1.0, 3.0, 10.0, 30.0)
+    ),
+)
+
+
+def answer(method: Method, question: Question, short: bool = False) -> tuple[Answer, Sampled, Float[Array, "S d"]]:
+    """A method's published shapes, what they were made from, and the position of each."""
+    begun = time.monotonic()
+    sampled = method.sample(question, short)
+    posterior, count = sampled.posterior, question.config.hypotheses
+    if len(posterior.log_weights) > count:
+        chosen, weights, _ = thin(posterior, count)
+    else:
+        chosen = np.arange(len(posterior.log_weights))
+        weights = np.exp(np.asarray(posterior.log_weights, np.float64))
+    model, sizeless = question.prior.model, without_sizes(sampled.likelihood)
+    positions, pose_sigma = posterior.positions[jnp.asarray(chosen)], sampled.observation.pose_sigma
+    if sampled.cube.sight_sigma > 0.0 and len(chosen) > 1:  # as perception publishes; one best shape is no draw
+        drawn = jax.random.normal(jax.random.fold_in(question.key, 1), posterior.log_weights.shape)
+        factor = sampled.cube.sight_sigma * drawn[jnp.asarray(chosen)]
+        camera = jnp.asarray(sampled.cube.to_cube(np.zeros(3)), jnp.float32)
+        positions = scaled_about(model, positions, pose_sigma, camera, factor)
+    view = question.view
+    asked = jnp.asarray(answered_voxels(view.frame, view.segment, sampled.cube, question.config.grid))
+    opacity = opacity_grids(model, sizeless, positions, pose_sigma, asked)
+    shapes = coarsen(solid(np.asarray(opacity)), GRID)
+    seconds = time.monotonic() - begun if sampled.seconds is None else sampled.seconds
+    return Answer(shapes, weights / weights.sum(), seconds, posterior.result), sampled, positions

@@ -1,0 +1,69 @@
+"""How long a start takes: from a new process to a node that may open its camera, with an empty compilation cache and
+with a filled one.
+
+What `farside live` does before its first frame, in a process of its own: imports, the prior, and every level of the
+controller once on the shipped recording.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.rows import Row
+from benchmarks.summary import mean_rows, say, table
+
+PARTS = ("imports", "prior", "programs", "whole")
+EMPTY, FILLED = "empty cache", "filled cache"
+
+
+def _start(begun: float) -> dict[str, float]:
+    """Seconds of each part, in this new process, which the parent began at `begun` (time.time)."""
+    from perception.track import Tracker
+    from perception.warm import warm_up
+    from probnerf.store import load_prior
+
+    imported = time.time()
+    prior = load_prior(None)
+    loaded = time.time()
+    warm_up(Tracker(prior))
+    ready = time.time()
+    return dict(zip(PARTS, (imported - begun, loaded - imported, ready - loaded, ready - begun), strict=True))
+
+
+def _started(cache: str) -> dict[str, float]:
+    """`_start` in a new process that compiles into `cache`."""
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": cache}
+    command = [sys.executable, "-m", "benchmarks.startup", str(time.time())]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if run.returncode != 0:
+        raise RuntimeError(f"{' '.join(command)} ended with {run.returncode}:\n{run.stderr[-2000:]}")
+    return json.loads(run.stdout.splitlines()[-1])
+
+
+def main(out: Path, quick: bool = False, n: int = 5) -> list[Row]:
+    """Seconds from a new process to a node that may open its camera.
+
+    Args:
+        n: starts with a filled cache
+    """
+    with tempfile.TemporaryDirectory() as cache:
+        found = {EMPTY: [_started(cache)]}
+        say(f"{EMPTY}: {found[EMPTY][0]['whole']:.1f} s")
+        found[FILLED] = [_started(cache) for _ in range(1 if quick else n)]
+    rows, lines = [], []
+    for condition, starts in found.items():
+        for part in PARTS:
+            rows += mean_rows("startup", "node", condition, part, [s[part] for s in starts], "s")
+        lines.append([condition, str(len(starts)), *(f"{np.median([s[part] for s in starts]):.1f}" for part in PARTS)])
+    table("Seconds of a start, medians", ("condition", "starts", *PARTS), lines)
+    return rows
+
+
+if __name__ == "__main__":
+    print(json.dumps(_start(float(sys.argv[1]))))
