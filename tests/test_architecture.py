@@ -33,7 +33,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "numpy": ("*",),
     "jaxtyping": ("*",),
     # JAX is probnerf's; perception meets it only where arrays are handed over.
-    "jax": ("probnerf/*", "perception/observe.py", "perception/controller.py", "benchmarks/*"),
+    "jax": ("probnerf/*", "perception/observe.py", "perception/controller.py", "perception/publish.py", "benchmarks/*"),
     "equinox": ("probnerf/*", "benchmarks/*"),
     "optax": ("probnerf/train.py", "probnerf/variational.py", "probnerf/baselines/*"),
     "safetensors": ("probnerf/store.py",),
