@@ -44,8 +44,9 @@ struct PixelGradient {
 };
 
 // A crossing whose compositing weight is less (of a free ray: whose optical depth, times what the pixel says against it) is
-// passed over: its colour, and its gradients, are so small against the others'. Sharp walls leave one crossing of ten.
-constexpr float NEGLIGIBLE = 1e-8f;
+// passed over. Sharp walls leave one crossing of ten: at 1e-8 the many tails together showed in the gradient (5e-4 of it),
+// at 1e-11 they do not, and it costs as little.
+constexpr float NEGLIGIBLE = 1e-11f;
 
 // From a tile's densities, which its first pixel's first crossing begins, to all that needs no colour.
 inline void composite(const PixelModel& m, const Crossings& view, const Pixel* pixels, int count, float per_density,

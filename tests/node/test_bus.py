@@ -262,7 +262,9 @@ def test_nodes_meet_at_a_router(mode: str) -> None:
             came: list[str] = []
             other.subscribe("/latched", TEXT, lambda message: came.append(message.data), latched=True)
             assert until(lambda: came == ["last"])
-            assert until(lambda: len([t for t in other.graph() if "/NN/" in t]) == 2)
+            # Others on this machine may have met here, too.
+            nodes = {bus.node.token(0, "NN"), other.node.token(0, "NN")}
+            assert until(lambda: nodes <= set(other.graph()), 60.0), other.graph()
 
 
 def certificates(folder: Path, *names: str) -> None:
