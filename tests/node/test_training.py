@@ -78,6 +78,7 @@ def test_the_recipe_is_handed_over_and_the_weights_exported(
     assert str(folder / "curves.png") in said and "farside bench prior --prior" in said
 
 
+@pytest.mark.slow
 def test_training_goes_on_from_weights_of_the_same_preset(
     tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture
 ) -> None:

@@ -30,6 +30,7 @@ def answers_of(config: ControllerConfig, stages: int | None = None) -> tuple[Est
     return found, told
 
 
+@pytest.mark.slow
 def test_where_little_is_asked_the_least_level_is_all() -> None:
     found, told = answers_of(replace(CONFIG, unexplained=1.0, tolerance=inf))
     assert len(found.log) == 1 and found.log[0].startswith("2 x 10 particles: error")

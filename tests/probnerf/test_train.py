@@ -60,6 +60,7 @@ def test_a_killed_run_resumes_with_identical_results(solids: Solids, views: View
     assert [json.loads(line)["rays"] for line in lines] == [False] * 4 + [True] * 4
 
 
+@pytest.mark.slow
 def test_a_frozen_decoder_waits_for_recognition(solids: Solids, views: ViewSet, tmp_path: Path) -> None:
     steps = train(model(), solids, views, LIKELIHOOD, replace(CONFIG, frozen_steps=2), tmp_path)
     frozen, moved = [jax.tree.map(np.asarray, state) for state, _ in islice(steps, 4)][1::2]
@@ -70,6 +71,7 @@ def test_a_frozen_decoder_waits_for_recognition(solids: Solids, views: ViewSet, 
     assert np.any(frozen.recognition.output.weight != moved.recognition.output.weight)
 
 
+@pytest.mark.slow
 def test_another_recipe_does_not_continue_a_run(solids: Solids, views: ViewSet, tmp_path: Path) -> None:
     run(solids, views, tmp_path, steps=4)
     other = train(model(), solids, views, LIKELIHOOD, replace(CONFIG, learning_rate=1.0), tmp_path)
@@ -100,6 +102,7 @@ def test_weighted_rays_estimate_the_mean_over_all_pixels(views: ViewSet) -> None
     assert error.std() < 0.2
 
 
+@pytest.mark.slow
 def test_the_kernel_trains_as_plain_jax_does(solids: Solids, views: ViewSet, monkeypatch: pytest.MonkeyPatch) -> None:
     if not fused.available():
         pytest.skip("the kernel is not built: there was no C++ compiler")

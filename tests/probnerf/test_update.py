@@ -89,6 +89,7 @@ def test_an_unfinished_posterior_goes_on_from_its_temperature() -> None:
     assert abs(float(after.log_evidence) - float(done.log_evidence)) <= 1.0
 
 
+@pytest.mark.slow
 def test_starts_are_weighed_by_the_law_that_they_were_drawn_from() -> None:
     _, before = _first()
     positions, log_q = _start(before)
