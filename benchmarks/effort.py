@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.occluded import carton_seeds, half_hidden
 from benchmarks.rows import Row
 from benchmarks.scene import (
     GRID,
@@ -37,7 +38,6 @@ from probnerf.occupancy import coarsen
 from probnerf.store import load_prior
 
 EASY, HARD = CONDITIONS = ("plain can, seen well", "printed pitcher, half hidden")
-HIDDEN = (0.35, 0.65)  # share of a hard object's pixels that the carton hides
 CONTROLLER, LARGEST = METHODS = ("controller", "largest model")
 METRICS = {"point_gradients": "", "first_answer": "s", "seconds": "s", "hidden_nll": "nats"}
 
@@ -53,7 +53,7 @@ class Spent:
 def scenes(condition: str, count: int) -> Iterator[VesselView]:
     """The first `count` views of test seeds that fit a condition."""
     kind, texture = ("can", "plain") if condition == EASY else ("pitcher", "printed")
-    cartons = (s for s in TEST_SEEDS if KINDS[int(Placed(s, 0, 0, 0).shape.kind)] == "carton")
+    cartons = carton_seeds(TEST_SEEDS)
     found = 0
     for seed in TEST_SEEDS:
         shape = Placed(seed, 0.0, 0.0, 0.0).shape
@@ -63,7 +63,7 @@ def scenes(condition: str, count: int) -> Iterator[VesselView]:
             continue
         if condition == EASY and bool(shape.has_handle):
             continue
-        picture = _easy(seed) if condition == EASY else _hard(seed, next(cartons))
+        picture = _easy(seed) if condition == EASY else half_hidden(seed, next(cartons))
         try:
             if picture is not None:
                 yield vessel_view(picture)
@@ -77,25 +77,6 @@ def _easy(seed: int) -> VesselPicture:
     placed, T = place(seed, np.random.default_rng([seed, 41]), config)
     camera = simulated_camera(config)
     return VesselPicture(placed, camera, T, render(Scene((placed,)), camera, T))
-
-
-def _hard(seed: int, carton: int) -> VesselPicture | None:
-    """The first of a few draws in which the carton, on the way to the camera, hides as much as it should."""
-    config = ViewConfig(elevation=(15.0, 40.0))
-    rng, camera = np.random.default_rng([seed, 43]), simulated_camera(config)
-    small = simulated_camera(
-        replace(config, width=80, height=60, focal=75.0)
-    )  # to try a place, a small picture will do
-    for _ in range(20):
-        placed, T = place(seed, rng, config)
-        towards = np.arctan2(T[1, 3] - placed.y, T[0, 3] - placed.x) + rng.uniform(-0.6, 0.6)
-        away = placed.half_extent + Placed(carton, 0, 0, 0).half_extent
-        at = (placed.x + away * np.cos(towards), placed.y + away * np.sin(towards))
-        before = Placed(carton, float(at[0]), float(at[1]), float(rng.uniform(-np.pi, np.pi)))
-        alone, shown = (int((render(Scene(o), small, T).label == 1).sum()) for o in ((placed,), (placed, before)))
-        if HIDDEN[0] <= 1.0 - shown / max(alone, 1) <= HIDDEN[1]:
-            return VesselPicture(placed, camera, T, render(Scene((placed, before)), camera, T))
-    return None
 
 
 def main(out: Path, quick: bool = False, prior: Path | None = None, n: int = 8, seed: int = 0) -> list[Row]:

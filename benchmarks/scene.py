@@ -1,5 +1,6 @@
 """Vessels on a simulated table whose handle no pixel shows, or many do, with the truth in the view frame."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -108,15 +109,19 @@ def vessel_picture(seed: int, handle: Handle, config: ViewConfig | None = None) 
     return None
 
 
-def vessel_view(picture: VesselPicture, depth: bool = True) -> VesselView:
+def vessel_view(
+    picture: VesselPicture, depth: bool = True, fault: Callable[[Frame], Frame] | None = None
+) -> VesselView:
     """What perception makes of a picture through a faulty sensor, with the truth in the cube that it chose.
 
-    Without `depth` the segment is the true mask's, on the plane that the camera's pose over the table gives (with
+    A `fault` is done to the frame on top of the sensor's; what is truly seen and there stays what it is. Without
+    `depth` the segment is the true mask's, on the plane that the camera's pose over the table gives (with
     `PlaneGuess`'s errors of it): what a user has to say of a picture. Raises ValueError where perception refuses.
     """
     placed, camera, seed = picture.placed, picture.camera, picture.placed.seed
     frame = sense(picture.picture, camera, picture.T_world_camera, seed)
     frame = frame if depth else replace(frame, depth=None)
+    frame = frame if fault is None else fault(frame)
     found = segment(frame, 1)[0]
     cube = object_frame(frame, found, ObserveConfig())
     faultless = Frame(0, frame.frame_id, frame.rgb, picture.picture.depth.astype(np.float32), None, camera)

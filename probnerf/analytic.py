@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from probnerf import foam
-from probnerf.model import CylinderModel, Likelihood, faces_of_view, mean_colour, split_position
+from probnerf.model import CylinderModel, Likelihood, Model, faces_of_view, mean_colour, range_offset_of, split_position
 from probnerf.types import FREE, OBJECT, UNKNOWN, Observation, Rays
 
 Args = tuple[CylinderModel, Likelihood, Observation, Float[Array, "n m"]]  # what `model.log_likelihood` takes
@@ -47,21 +47,24 @@ def grid_of_rays(columns: int, rows: int, elevation: float = 20.0, distance: flo
 @eqx.filter_jit
 def draw_pixels(
     key: PRNGKeyArray,
-    model: CylinderModel,
+    model: Model,
     likelihood: Likelihood,
     position: Float[Array, "d"],
     rays: Rays,
     known: Bool[Array, "n"],
     depth: Bool[Array, ""],
     range_sigma: float = 0.02,
+    pose_sigma: Float[Array, "5"] | None = None,
 ) -> Observation:
     """One observation of the object at `position`: where each ray ends, the mask bit, the depth and the colour.
 
-    Pixels that are not `known` are UNKNOWN and say nothing; without `depth`, OBJECT pixels carry colour alone.
+    Pixels that are not `known` are UNKNOWN and say nothing; without `depth`, OBJECT pixels carry colour alone. They are
+    drawn from `pixel_terms`' density at a `reach` without end and a power of 1. Without `pose_sigma` only the yaw is
+    unknown.
     """
     n = rays.origin.shape[0]
     keys = jax.random.split(key, 6)
-    pose_sigma = jnp.zeros(5)
+    pose_sigma = jnp.zeros(5) if pose_sigma is None else pose_sigma
     weights, pose = split_position(model, likelihood, position, pose_sigma)
     picture = foam.render(model.field, weights, rays, likelihood.lattice, pose)
     end = jax.random.categorical(
@@ -73,7 +76,7 @@ def draw_pixels(
 
     gap = foam.gap_before(picture.t)
     deviation = jnp.sqrt(range_sigma**2 + likelihood.wall_sigma**2 + gap**2 / 12.0)
-    surface = picture.t - 0.5 * gap
+    surface = picture.t - 0.5 * gap + range_offset_of(model, likelihood, position, pose_sigma)
     wall = jnp.take_along_axis(surface + deviation * jax.random.normal(keys[2], surface.shape), face, axis=1)[:, 0]
     middle = jnp.linalg.norm(rays.origin, axis=1)
     nowhere = middle + likelihood.outlier_span * jax.random.uniform(keys[3], (n,), minval=-0.5, maxval=0.5)

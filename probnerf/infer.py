@@ -78,11 +78,10 @@ class InferConfig:
             )
 
 
-def likelihood_of(config: InferConfig, observation: Observation, sample_pose: bool = True) -> Likelihood:
-    """The likelihood's settings for one view, with its sizes where there is no kernel (`with_sizes`)."""
-    lattice = foam.Lattice(config.lattice, config.extent, below=config.below)
-    likelihood = Likelihood(
-        lattice=lattice,
+def likelihood_settings(config: InferConfig, sample_pose: bool = True) -> Likelihood:
+    """The likelihood's settings, for any view."""
+    return Likelihood(
+        lattice=foam.Lattice(config.lattice, config.extent, below=config.below),
         colour_sigma=config.colour_sigma,
         wall_sigma=config.wall_sigma,
         outlier=config.outlier,
@@ -91,6 +90,11 @@ def likelihood_of(config: InferConfig, observation: Observation, sample_pose: bo
         sample_pose=sample_pose,
         sample_delta=config.sample_delta,
     )
+
+
+def likelihood_of(config: InferConfig, observation: Observation, sample_pose: bool = True) -> Likelihood:
+    """The likelihood's settings for one view, with its sizes where there is no kernel (`with_sizes`)."""
+    likelihood = likelihood_settings(config, sample_pose)
     return likelihood if fused.available() else with_sizes(likelihood, observation)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 from scipy.spatial import cKDTree
 from scipy.special import stdtrit
+from scipy.stats import binom
 
 BASE_RATE_SHARE = 0.02  # the share of the base rate that smoothing mixes into every method's probabilities
 SCORED_RATES = (0.02, 0.98)  # voxels whose training-set frequency lies inside are scored; the others are known to all
@@ -173,6 +174,22 @@ def ks_distance(ranks: Float[np.ndarray, "n"]) -> float:
         return float("nan")
     steps = np.arange(len(u) + 1) / len(u)
     return float(max(np.max(steps[1:] - u), np.max(u - steps[:-1])))
+
+
+def uniform_band(
+    n: int, level: float = 0.95, points: int = 50, simulations: int = 4000
+) -> tuple[Float[np.ndarray, "points"], Float[np.ndarray, "points"], Float[np.ndarray, "points"]]:
+    """Where the distribution function of n uniform ranks is evaluated, and its lowest and highest values there.
+
+    The band is simultaneous: `level` of all uniform samples stay inside at every point (Sailynoja, Buerkner and Vehtari
+    2022, with the coverage by simulation).
+    """
+    at = np.arange(1, points) / points
+    drawn = np.random.default_rng(0).random((simulations, n))
+    below = np.stack([(drawn <= a).sum(axis=1) for a in at], axis=1)
+    tail = np.minimum(binom.cdf(below, n, at), binom.sf(below - 1, n, at))  # of the less likely side, at each point
+    each = np.quantile(tail.min(axis=1), 1.0 - level)
+    return at, binom.ppf(each, n, at) / n, binom.isf(each, n, at) / n
 
 
 def falsely_free(p_free: Float[np.ndarray, "n"], occupied: Bool[np.ndarray, "n"], threshold: float = 0.95) -> float:

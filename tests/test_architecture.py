@@ -24,7 +24,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "probnerf": set(),
     "perception": {"calibration", "probnerf"},
     "node": {"calibration", "probnerf", "perception", "benchmarks"},
-    "benchmarks": {"calibration", "probnerf", "perception", "node"},
+    "examples": {"node"},  # what a user of the node would write
+    "benchmarks": {"calibration", "probnerf", "perception", "node", "examples"},
 }
 PACKAGES = ("calibration", "probnerf", "perception", "node")  # installed; `benchmarks` runs from a checkout
 
@@ -55,7 +56,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "yaml": ("calibration/camera_info.py", "node/config.py"),  # camera files; launch files
     "zenoh": ("node/bus.py",),
     "viser": ("node/page.py",),
-    "tyro": ("node/__main__.py", "node/options.py", "benchmarks/*"),
+    "tyro": ("node/__main__.py", "node/options.py", "benchmarks/*", "examples/*"),
     "rich": ("node/*", "benchmarks/*"),
     "matplotlib": ("node/plot*.py", "benchmarks/*"),
 }

@@ -11,7 +11,7 @@ import pytest
 
 from probnerf.hmc import StageInfo
 from probnerf.populations import log_prior
-from probnerf.resampling import next_beta, resample
+from probnerf.resampling import next_beta
 from probnerf.smc import TemperedSMCConfig, tempered_smc
 from probnerf.types import Posterior
 
@@ -271,17 +271,6 @@ def test_evidence_power_flattens_the_populations_shares():
     np.testing.assert_allclose(even, 0.25, rtol=1e-4)
     assert np.ptp(whole) > 1e-3
     assert float(runs[0].log_evidence) == float(runs[2].log_evidence)
-
-
-def test_systematic_resampling_copies_each_particle_its_due():
-    rng = np.random.default_rng(0)
-    for seed in range(20):
-        log_w = np.where(rng.random(100) < 0.3, -np.inf, 3 * rng.normal(size=100))
-        w = np.exp(log_w) / np.exp(log_w).sum()
-        counts = np.bincount(resample(jax.random.key(seed), jnp.asarray(log_w, jnp.float32), 64), minlength=100)
-        assert counts.sum() == 64
-        assert np.all(np.abs(counts - 64 * w) < 1 + 1e-4)
-        assert np.all(counts[w == 0] == 0)
 
 
 def test_the_step_of_beta():

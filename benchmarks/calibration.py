@@ -1,0 +1,269 @@
+"""Does p_occupied mean what it says: the posterior and its rivals over unseen space, objects of every kind.
+
+Test seeds, the whole path from RGB-D frame to hypotheses, yaw unknown. Conditions:
+
+- any view: the next objects of the family as they come, any kind, from a random camera. Nothing is selected by what the
+  view hides, so a right posterior is calibrated here.
+- half hidden: the same with a carton before them that hides 35 to 65% of their pixels.
+- handle hidden: vessels whose handle no pixel shows. They are selected by a truth that the view leaves open (every one
+  has a handle): even a right posterior errs here, towards no handle.
+
+Measures: as `farside bench hidden`, over unseen voxels whose training-set frequency lies in (0.02, 0.98), smoothed
+alike. hidden_ece here pools the voxels of all objects (15 bins); voxels of one object err together, so that its 95%
+interval is a bootstrap over objects. mean_iou and best_of_8_iou are of whole shapes.
+
+Results are appended to a file, object by object, and what is there is not made again.
+"""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from functools import partial
+from hashlib import sha256
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from benchmarks.occluded import carton_seeds, half_hidden
+from benchmarks.results import Line, append_line, key, newest, read_lines
+from benchmarks.rivals import METHODS, POSTERIOR, RivalConfig, answers
+from benchmarks.rows import Row
+from benchmarks.scene import (
+    VesselPicture,
+    VesselView,
+    ViewConfig,
+    base_rate,
+    place,
+    simulated_camera,
+    vessel_picture,
+    vessel_view,
+)
+from benchmarks.score import BOXES, Answer, random_boxes, score
+from benchmarks.summary import mean_rows, say, table
+from perception.controller import ControllerConfig
+from perception.simulate import Scene, render
+from probnerf.families.tabletop import TEST_SEEDS
+from probnerf.metrics import (
+    ECE_BINS,
+    best_of_k_iou,
+    coverage,
+    falsely_free,
+    ks_distance,
+    mean_iou,
+    paired_interval,
+    scored_voxels,
+    uniform_band,
+)
+from probnerf.store import load_prior
+
+RESULTS = Path(__file__).with_suffix(".jsonl")
+ANY, HALF, HANDLE = "any view", "half hidden", "handle hidden"
+PER_OBJECT = {"hidden_nll": "nats", "hidden_brier": "", "mean_iou": "", "best_of_8_iou": "", "seconds": "s"}
+COLOURS = dict(zip(METHODS, ("tab:blue", "tab:gray", "tab:orange", "tab:red"), strict=True))
+
+
+def any_view(seed: int) -> VesselPicture:
+    """The object of a family seed from a random camera."""
+    config = ViewConfig()
+    placed, T = place(seed, np.random.default_rng([seed, 47]), config)
+    camera = simulated_camera(config)
+    return VesselPicture(placed, camera, T, render(Scene((placed,)), camera, T))
+
+
+def _half(seed: int) -> VesselPicture | None:
+    return half_hidden(seed, next(carton_seeds(range(seed + 1, seed + 1000))))
+
+
+# which seeds, counted from the end of the test seeds' first half so that conditions share no object, and the picture
+SORTS: dict[str, tuple[int, Callable[[int], VesselPicture | None]]] = {
+    ANY: (0, any_view),
+    HALF: (2000, _half),
+    HANDLE: (4000, partial(vessel_picture, handle="hidden")),
+}
+
+
+def views(condition: str, n: int, known: Callable[[int], bool]) -> Iterator[tuple[int, VesselView | None]]:
+    """(seed, view) of the first `n` objects; None where `known` says that it is not needed."""
+    begin, picture_of = SORTS[condition]
+    found = 0
+    for number in count(begin):
+        if found == n or number >= len(TEST_SEEDS):
+            return
+        seed = TEST_SEEDS[number]
+        if known(seed):
+            found += 1
+            yield seed, None
+            continue
+        picture = picture_of(seed)
+        try:
+            view = None if picture is None else vessel_view(picture)
+        except ValueError:  # outside perception's range of sizes, or too few pixels
+            continue
+        if view is not None:
+            found += 1
+            yield seed, view
+
+
+def judged(view: VesselView, answer: Answer, rate: Float[np.ndarray, "32 32 32"], seed: int) -> dict[str, Any]:
+    """One answer's line: measures, ranks, and the reliability histogram's sums."""
+    scored = scored_voxels(view.seen, rate)
+    rng = np.random.default_rng([seed, view.seed, 31])
+    boxes = random_boxes(scored, BOXES, rng)
+    found = score(view, answer, rate, boxes, rng)
+    p, truth = found.probability[scored], view.solid[scored]
+    bins = np.minimum((p * ECE_BINS).astype(int), ECE_BINS - 1)
+    return {
+        **{name: round(float(found.values[name]), 5) for name in ("hidden_nll", "hidden_brier")},
+        "mean_iou": round(mean_iou(answer.shapes, answer.weights, view.solid), 4),
+        "best_of_8_iou": round(best_of_k_iou(answer.shapes, answer.weights, view.solid, 8), 4),
+        "seconds": round(answer.seconds, 3),
+        "result": answer.result,
+        "ranks": found.ranks.round(4).tolist(),
+        "p_free": found.p_free.round(4).tolist(),
+        "occupied": found.occupied.astype(int).tolist(),
+        "voxels": np.bincount(bins, minlength=ECE_BINS).tolist(),
+        "probability": np.bincount(bins, weights=p, minlength=ECE_BINS).round(3).tolist(),
+        "truth": np.bincount(bins, weights=truth, minlength=ECE_BINS).astype(int).tolist(),
+    }
+
+
+def main(
+    out: Path,
+    quick: bool = False,
+    prior: Path | None = None,
+    n: int = 70,
+    conditions: str = "",
+    seed: int = 0,
+    results: Path = RESULTS,
+    only_chart: bool = False,
+) -> list[Row]:
+    """Reliability of p_occupied in unseen space, ranks of volumes and scores, beside prior, encoder and MAP.
+
+    Args:
+        prior: weights to use; the shipped ones by default
+        n: objects of each condition
+        conditions: only these, separated by semicolons: any view; half hidden; handle hidden
+        seed: of the samplers
+        results: file that results are appended to, and read from
+        only_chart: draw what the file holds
+    """
+    if quick:
+        n, conditions = min(n, 2), conditions or ANY
+        results = out / "calibration.jsonl" if results == RESULTS else results
+    asked = [c.strip() for c in conditions.split(";") if c.strip()] or list(SORTS)
+    if unknown := set(asked) - set(SORTS):
+        raise ValueError(f"no condition {sorted(unknown)}; there are: {'; '.join(SORTS)}")
+    loaded, config, rivals = load_prior(prior), ControllerConfig(), RivalConfig()
+    told = json.dumps([asdict(config), asdict(rivals)], sort_keys=True, default=str)
+    common = {"prior": loaded.hash, "settings": {"digest": sha256(told.encode()).hexdigest()[:12]}, "seed": seed}
+    if not only_chart:
+        done = {key(line) for line in read_lines(results)}
+        rate = base_rate(128 if quick else 1024, config=config.observe)
+        for condition in asked:
+            own = {**common, "condition": condition}
+
+            def known(number: int, own: Line = own) -> bool:
+                return all(key({**own, "method": m, "object": number}) in done for m in METHODS)
+
+            for number, view in views(condition, n, known):
+                if view is None:
+                    continue
+                given = answers(view, loaded, config, rivals, seed, None, 240)
+                lines = {
+                    m: {**own, "method": m, "object": number, **judged(view, a, rate, seed)} for m, a in given.items()
+                }
+                for line in answered.values():
+                    append_line(results, line)
+                say(f"{condition}, {number}: " + ", ".join(f"{m} {v['hidden_nll']:.3f}" for m, v in answered.items()))
+    lines = [line for line in newest(read_lines(results), loaded.hash, seed) if line["condition"] in asked]
+    if not lines:
+        raise ValueError(f"{results} has no results of this prior and these conditions; leave --only-chart")
+    rows = _rows(lines)
+    _draw(lines, out / "calibration.png")
+    return rows
+
+
+def pooled_ece(lines: list[Line], resamples: int = 400) -> tuple[float, float, float]:
+    """The error over all voxels of all objects, and its 95% bootstrap interval over objects."""
+    truth, probability, voxels = (
+        np.array([line[k] for line in lines], np.float64) for k in ("truth", "probability", "voxels")
+    )
+
+    def error(rows: np.ndarray) -> float:
+        return float(np.abs((truth[rows] - probability[rows]).sum(axis=0)).sum() / voxels[rows].sum())
+
+    rng = np.random.default_rng(0)
+    drawn = [error(rng.integers(len(lines), size=len(lines))) for _ in range(resamples)]
+    low, high = np.quantile(drawn, (0.025, 0.975))
+    return error(np.arange(len(lines))), float(low), float(high)
+
+
+def _rows(lines: list[Line]) -> list[Row]:
+    rows, cells = [], []
+    for condition in [c for c in SORTS if any(line["condition"] == c for line in lines)]:
+        by = {
+            m: sorted((x for x in lines if x["condition"] == condition and x["method"] == m), key=lambda x: x["object"])
+            for m in METHODS
+        }
+        for method, own in by.items():
+            for metric, unit in PER_OBJECT.items():
+                rows += mean_rows("calibration", method, condition, metric, [x[metric] for x in own], unit)
+            ranks, p_free, occupied = (np.concatenate([x[k] for x in own]) for k in ("ranks", "p_free", "occupied"))
+            ece = pooled_ece(own)
+            pooled = {
+                "hidden_ece": ece[0], "hidden_ece_q025": ece[1], "hidden_ece_q975": ece[2],
+                "coverage90": coverage(ranks), "ks": ks_distance(ranks),
+                "falsely_free": falsely_free(p_free, occupied.astype(bool)),
+            }  # fmt: skip
+            rows += [Row("calibration", method, condition, k, float(v), "", len(own)) for k, v in pooled.items()]
+            gap = paired_interval(*(np.array([x["hidden_nll"] for x in by[m]]) for m in (method, POSTERIOR)))
+            for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
+                rows.append(
+                    Row("calibration", method, condition, f"hidden_nll_above_posterior{label}", value, "nats", gap.n)
+                )
+            mean = {m: float(np.mean([x[m] for x in own])) for m in PER_OBJECT}
+            cells.append([
+                f"{condition} ({len(own)})", method, *(f"{mean[m]:.3f}" for m in PER_OBJECT),
+                f"{ece[0]:.3f} ({ece[1]:.3f}..{ece[2]:.3f})", f"{pooled['coverage90']:.3f}",
+                f"{pooled['falsely_free']:.3f}",
+                "" if method == POSTERIOR else f"{gap.low:+.3f}..{gap.high:+.3f}",
+            ])  # fmt: skip
+    header = ("condition", "method", *PER_OBJECT, "ece, pooled", "coverage90", "falsely_free", "nll above posterior's")
+    table("Unseen space", header, cells)
+    return rows
+
+
+def _draw(lines: list[Line], path: Path) -> None:
+    """Per condition: reliability of every method; distribution of the posterior's ranks with its band."""
+    conditions = [c for c in SORTS if any(line["condition"] == c for line in lines)]
+    figure = Figure(figsize=(4.6 * len(conditions), 8), layout="constrained")
+    axes = figure.subplots(2, len(conditions), squeeze=False)
+    for (top, bottom), condition in zip(axes.T, conditions, strict=True):
+        own = [line for line in lines if line["condition"] == condition]
+        _reliability(top, own)
+        objects = len({line["object"] for line in own})
+        top.set(title=f"{condition}, {objects} objects", xlabel="p_occupied", ylabel="share occupied")
+        ranks = np.concatenate([line["ranks"] for line in own if line["method"] == POSTERIOR])
+        at, low, high = uniform_band(objects)  # boxes of one object err together: as if each had one
+        bottom.fill_between(at, low - at, high - at, color="0.85", label="95% band, one box an object")
+        bottom.plot(at, np.mean(ranks[:, None] <= at, axis=0) - at, color=COLOURS[POSTERIOR])
+        bottom.axhline(0.0, color="k", linewidth=0.6)
+        bottom.set(xlabel="rank of a box's true volume", ylabel="share below, less uniform", title="ranks, posterior")
+        bottom.legend(fontsize=8)
+    axes[0, 0].legend(fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
+
+
+def _reliability(ax: Axes, lines: list[Line]) -> None:
+    ax.plot([0, 1], [0, 1], "k--", linewidth=1)
+    for method in METHODS:
+        own = [line for line in lines if line["method"] == method]
+        voxels, p, truth = (np.sum([line[k] for line in own], axis=0) for k in ("voxels", "probability", "truth"))
+        shown = voxels > 200
+        ax.plot(p[shown] / voxels[shown], truth[shown] / voxels[shown], "o-", color=COLOURS[method], label=method, ms=4)

@@ -1,0 +1,186 @@
+"""Simulation-based calibration: does the sampler hand back the posterior of its own model?
+
+A position is drawn from the prior N(0, I), pixels from the density that the likelihood evaluates (`draw_pixels`), and
+the sampler answers. Over many such draws the rank of the truth among the posterior's weighted samples is uniform for
+any statistic (Talts et al. 2018); volumes have atoms, so ranks are randomised. Nothing of the world enters, no sensor
+and no shape that the prior does not know: what is wrong here is the sampler's, and what is wrong only elsewhere
+(`farside bench hidden`) is the model's. Statistics, each of the shape on 24^3 voxels:
+
+- volume: of the whole shape; hidden: of its half away from the camera; voxel: whether one random far voxel is solid
+- yaw (where the pose is unknown); log_likelihood of the pixels
+
+outside: how far the ranks' distribution function leaves the band that 95% of uniform samples stay in as a whole
+(`metrics.uniform_band`), 0 where it stays inside. coverage90: share of truths in the central 90%.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from matplotlib.figure import Figure
+
+from benchmarks.rows import Row
+from benchmarks.summary import say, table
+from probnerf.analytic import draw_pixels, grid_of_rays
+from probnerf.infer import InferConfig, likelihood_of, likelihood_settings, opacity_grids
+from probnerf.metrics import coverage, ks_distance, randomised_rank, uniform_band
+from probnerf.model import CylinderModel, Likelihood, Model, faces_of_view, log_likelihood, pose_of
+from probnerf.occupancy import solid, voxel_centres
+from probnerf.populations import thin
+from probnerf.smc import TemperedSMCConfig, tempered_smc
+from probnerf.store import load_prior
+from probnerf.types import Posterior
+
+GRID = 24
+POSE_SIGMA = (0.08, 0.08, 0.06, 0.02, 0.03)  # of perception's usual widths, cube units
+STATISTICS = ("volume", "hidden", "voxel", "yaw", "log_likelihood")
+DRAWS = 64  # posterior samples that ranks are taken among
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A model, what of it is unknown, and a sampler."""
+
+    name: str
+    model: Callable[[], Model]
+    sampler: TemperedSMCConfig
+    pose: bool = True
+    delta: bool = False
+    columns: int = 8  # pixels: columns x rows
+    rows: int = 8
+    lattice: int = 32
+
+
+def _prior() -> Model:
+    return load_prior(None).model
+
+
+THOROUGH = TemperedSMCConfig(populations=2, particles=96, start_particles=768, moves=4, final_stages=2, keep=2)
+SHIPPED = replace(InferConfig().smc, evidence_power=1.0)
+CONDITIONS = (
+    Condition("cylinder", CylinderModel, TemperedSMCConfig(), lattice=16),
+    Condition("shipped prior, pose known", _prior, THOROUGH, pose=False),
+    Condition("shipped prior", _prior, THOROUGH),
+    Condition("shipped prior, delta", _prior, THOROUGH, delta=True),
+    Condition("shipped prior, default sampler", _prior, SHIPPED),
+    Condition("shipped prior, default sampler, root of the evidence", _prior, replace(SHIPPED, evidence_power=0.5)),
+)
+
+
+def _settings(condition: Condition) -> InferConfig:
+    """Inference's, as a density of pixels: no end to the ranges' reach, and each pixel counted once."""
+    return replace(InferConfig(), reach=1e6, power=1.0, sample_delta=condition.delta, lattice=condition.lattice)
+
+
+@jax.jit
+def _solid(model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "5"]):
+    return opacity_grids(model, likelihood, positions, pose_sigma, jnp.ones((GRID,) * 3, bool))
+
+
+def statistics(
+    model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "5"], voxel: int
+) -> dict[str, Float[np.ndarray, "s"]]:
+    """Of each position's shape; `voxel` counts those of the far half, which the camera at +x looks at last."""
+    shapes = solid(np.asarray(_solid(model, likelihood, positions, pose_sigma))).reshape(len(positions), -1)
+    far = np.flatnonzero(voxel_centres(GRID)[..., 0].ravel() < 0.0)
+    found = {
+        "volume": shapes.sum(axis=1),
+        "hidden": shapes[:, far].sum(axis=1),
+        "voxel": shapes[:, far[voxel % len(far)]],
+    }
+    if likelihood.sample_pose:
+        k = model.latent
+        found["yaw"] = np.asarray(pose_of(positions[:, k : k + 7], pose_sigma).yaw)
+    return {name: np.asarray(value, np.float64) for name, value in found.items()}
+
+
+def ranks_of(condition: Condition, model: Model, seed: int) -> tuple[dict[str, float], Posterior]:
+    """The truth's randomised ranks in one draw from the model, by statistic, and the posterior."""
+    rng = np.random.default_rng([seed, 41])
+    key = jax.random.key(seed)
+    rays = grid_of_rays(condition.columns, condition.rows, elevation=30.0)
+    pose_sigma = jnp.asarray(POSE_SIGMA if condition.pose else np.zeros(5), jnp.float32)
+    known = jnp.ones(condition.columns * condition.rows, bool)
+    drawn = likelihood_settings(_settings(condition), condition.pose)
+    dim = drawn.dim(model)
+    truth = jax.random.normal(jax.random.fold_in(key, 0), (dim,))
+    observation = draw_pixels(
+        jax.random.fold_in(key, 1), model, drawn, truth, rays, known, jnp.asarray(True), pose_sigma=pose_sigma
+    )
+    likelihood = likelihood_of(_settings(condition), observation, sample_pose=condition.pose)
+    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
+    posterior = tempered_smc(jax.random.fold_in(key, 2), log_likelihood, args, dim, condition.sampler)
+    chosen, weights, _ = thin(posterior, DRAWS)
+    positions = jnp.concatenate([truth[None], posterior.positions[jnp.asarray(chosen)]])
+    found = statistics(model, likelihood, positions, pose_sigma, int(rng.integers(2**31)))
+    found["log_likelihood"] = np.asarray(_value(args, positions), np.float64)
+    ranks = {name: randomised_rank(v[1:], weights, v[0], rng) for name, v in found.items()}
+    return ranks, posterior
+
+
+@jax.jit
+def _value(args, positions):
+    return log_likelihood(args, positions)
+
+
+def main(out: Path, quick: bool = False, n: int = 200, conditions: str = "") -> list[Row]:
+    """Simulation-based calibration of tempered SMC: ranks of the truth in draws from the model itself.
+
+    Args:
+        n: draws of each condition
+        conditions: only those whose name holds one of these, separated by semicolons
+    """
+    n = min(n, 20) if quick else n
+    wanted = [c.strip() for c in (conditions or ("cylinder" if quick else "")).split(";") if c.strip()]
+    chosen = [c for c in CONDITIONS if not wanted or c.name in wanted]
+    if not chosen:
+        raise ValueError(f"no condition {conditions!r}; there are: {'; '.join(c.name for c in CONDITIONS)}")
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for condition in chosen:
+        model, ranks = condition.model(), []
+        for seed in range(n):
+            one, posterior = ranks_of(condition, model, seed)
+            ranks.append(one)
+            if (seed + 1) % 20 == 0:
+                say(f"{condition.name}: {seed + 1} of {n} draws ({posterior.result})")
+        found[condition.name] = {name: np.array([r[name] for r in ranks]) for name in ranks[0]}
+    rows, lines = [], []
+    for name, by in found.items():
+        for statistic, u in by.items():
+            values = {"outside": outside(u), "ks": ks_distance(u), "coverage90": coverage(u)}
+            rows += [Row("sbc", name, statistic, metric, value, "", len(u)) for metric, value in values.items()]
+            lines.append([name, statistic, *(f"{v:.3f}" for v in values.values())])
+    table(f"Ranks of the truth, {n} draws", ("condition", "statistic", "outside", "ks", "coverage90"), lines)
+    _draw(found, out / "sbc.png")
+    return rows
+
+
+def outside(ranks: Float[np.ndarray, "n"]) -> float:
+    """The farthest that the ranks' distribution function leaves its simultaneous 95% band."""
+    at, low, high = uniform_band(len(ranks))
+    share = np.mean(np.asarray(ranks)[:, None] <= at, axis=0)
+    return float(max(0.0, np.max(low - share), np.max(share - high)))
+
+
+def _draw(found: dict[str, dict[str, np.ndarray]], path: Path) -> None:
+    """Each condition's rank distribution functions, less the uniform one, with the band."""
+    figure = Figure(figsize=(4.2 * min(3, len(found)), 3.4 * -(-len(found) // 3)), layout="constrained")
+    axes = figure.subplots(-(-len(found) // 3), min(3, len(found)), squeeze=False, sharey=True)
+    for ax in axes.ravel()[len(found) :]:
+        ax.set_axis_off()
+    for ax, (name, by) in zip(axes.ravel(), found.items(), strict=False):
+        at, low, high = uniform_band(len(next(iter(by.values()))))
+        ax.fill_between(at, low - at, high - at, color="0.85", label="95% of uniform samples")
+        for statistic, u in by.items():
+            ax.plot(at, np.mean(u[:, None] <= at, axis=0) - at, label=statistic, linewidth=1.2)
+        ax.axhline(0.0, color="k", linewidth=0.6)
+        ax.set(title=name, xlabel="rank of the truth")
+        ax.title.set_fontsize(9)
+    axes[0, 0].set_ylabel("share of ranks below, less uniform")
+    axes[0, 0].legend(fontsize=7)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)

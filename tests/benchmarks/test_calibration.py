@@ -1,0 +1,44 @@
+"""Calibration's sums: an error pooled over objects, ranks of draws from the model, the band of uniform samples."""
+
+import numpy as np
+import pytest
+
+from benchmarks.calibration import pooled_ece
+from benchmarks.sbc import CONDITIONS, STATISTICS, outside, ranks_of
+from probnerf.metrics import ECE_BINS, uniform_band
+
+
+def test_a_pooled_error_lets_objects_that_err_apart_cancel() -> None:
+    def line(truth: float) -> dict:
+        bins = np.zeros(ECE_BINS)
+        bins[7] = 100.0
+        return {"voxels": bins.tolist(), "probability": (0.5 * bins).tolist(), "truth": (truth * bins).tolist()}
+
+    assert pooled_ece([line(1.0), line(0.0)])[0] == 0.0
+    error, low, high = pooled_ece([line(0.8)] * 9 + [line(0.5)])
+    assert error == pytest.approx(0.27) and low <= error <= high
+
+
+@pytest.mark.parametrize("n", [20, 200])
+def test_the_band_holds_as_many_uniform_samples_as_it_says(n: int) -> None:
+    at, low, high = uniform_band(n)
+    drawn = np.random.default_rng(7).random((2000, n))
+    share = np.stack([(drawn <= a).mean(axis=1) for a in at], axis=1)
+    stay = np.mean(np.all((share >= low) & (share <= high), axis=1))
+    assert 0.93 < stay < 0.985  # counts are whole numbers: it may hold a little more than 95%
+    assert outside(drawn[0] ** 3) > 0.05  # ranks that crowd at one end leave it
+
+
+def test_a_draw_from_the_model_gets_a_rank_of_every_statistic() -> None:
+    ranks, posterior = ranks_of(CONDITIONS[0], CONDITIONS[0].model(), 0)
+    assert posterior.result == "converged"
+    assert set(ranks) == set(STATISTICS) and all(0.0 <= r <= 1.0 for r in ranks.values())
+
+
+@pytest.mark.slow
+def test_tempered_smc_is_calibrated_on_the_analytic_field() -> None:
+    condition = CONDITIONS[0]
+    model = condition.model()
+    ranks = [ranks_of(condition, model, seed)[0] for seed in range(100, 180)]
+    for name in STATISTICS:
+        assert outside(np.array([r[name] for r in ranks])) <= 0.03, name

@@ -1,0 +1,177 @@
+"""Laws of samplers, as functions of the sampler: tests call them with the real one, and with careless edits of it.
+
+Each raises AssertionError where its law is broken. Bounds are multiples of the Monte Carlo error, seeds fixed.
+"""
+
+import importlib
+import sys
+import types
+from pathlib import Path
+from types import ModuleType
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from probnerf.foam import Lattice
+from probnerf.model import Likelihood
+from probnerf.prior import PRESETS, ProbNeRF
+
+DIM = 6
+SIGMAS = 4.5
+
+
+def mutant(name: str, *edits: tuple[str, str]) -> ModuleType:
+    """Module `name` with pieces of its source replaced, each of which must be there exactly once."""
+    path = Path(importlib.import_module(name).__file__ or "")
+    source = path.read_text()
+    for old, new in edits:
+        assert source.count(old) == 1, f"{path.name} holds {old!r} {source.count(old)} times: the mutation is stale"
+        source = source.replace(old, new)
+    made = types.ModuleType(f"{name}_mutant")
+    made.__file__ = str(path)
+    sys.modules[made.__name__] = made  # dataclasses look their module up
+    exec(compile(source, str(path), "exec"), made.__dict__)
+    return made
+
+
+def linear(args, q):
+    """y ~ N(A q, I)."""
+    A, y = args
+    return -0.5 * jnp.sum((q @ A.T - y) ** 2, axis=1)
+
+
+def problem(precisions: tuple[float, ...] = (60.0, 9.0, 1.0), beta: float = 1.0):
+    """A linear-Gaussian problem: (A, y); mean and covariance at `beta`; log-evidence at beta = 1."""
+    rng = np.random.default_rng(0)
+    A = np.sqrt(precisions)[:, None] * np.linalg.qr(rng.normal(size=(DIM, DIM)))[0][: len(precisions)]
+    y = A @ rng.normal(size=DIM) + rng.normal(size=len(precisions))
+    covariance = np.linalg.inv(np.eye(DIM) + beta * A.T @ A)
+    marginal = np.eye(len(y)) + A @ A.T
+    evidence = -0.5 * y @ np.linalg.solve(marginal, y) - 0.5 * np.linalg.slogdet(marginal)[1]
+    args = (jnp.asarray(A, jnp.float32), jnp.asarray(y, jnp.float32))
+    return args, beta * covariance @ A.T @ y, covariance, evidence
+
+
+def assert_zero(values) -> None:
+    """The mean over the first axis, of independent values, is 0."""
+    values = np.asarray(values, np.float64)
+    error = values.std(axis=0, ddof=1) / np.sqrt(len(values))
+    assert np.all(np.abs(values.mean(axis=0)) <= SIGMAS * error + 1e-6)
+
+
+def hmc_leaves_its_target_alone(hmc: ModuleType) -> None:
+    """Exact draws of a tempered Gaussian are still its draws after twenty iterations of large steps."""
+    args, mean, covariance, _ = problem(beta=0.3)
+    start = np.random.default_rng(1).multivariate_normal(mean, covariance, size=8192)
+    target = hmc.Target(linear, args, jnp.asarray(0.3))
+
+    @jax.jit
+    def moved(q):
+        def body(state, key):
+            state, info = hmc.hmc_step(key, state, target, 0.4, 3)
+            return state, info.acceptance.mean()
+
+        return jax.lax.scan(body, target.evaluate(q), jax.random.split(jax.random.key(0), 20))
+
+    state, acceptance = moved(jnp.asarray(start, jnp.float32))
+    assert 0.3 < float(acceptance.mean()) < 0.95  # the accept test is needed
+    z = (np.asarray(state.position, np.float64) - mean) @ np.linalg.cholesky(np.linalg.inv(covariance))
+    assert_zero(z)
+    assert_zero(z**2 - 1.0)
+
+
+def smc_finds_evidence_and_moments(smc: ModuleType) -> None:
+    """Evidence ratios of independent runs average 1 (SMC is unbiased), and their means are the posterior's."""
+    args, mean, covariance, evidence = problem()
+    whiten = np.linalg.cholesky(np.linalg.inv(covariance))
+    config = smc.TemperedSMCConfig(populations=16, particles=48, start_particles=96, evidence_power=0.0)
+    posterior = smc.tempered_smc(jax.random.key(0), linear, args, DIM, config)
+    assert_zero(np.exp(np.asarray(posterior.diagnostics.log_evidences, np.float64) - evidence) - 1.0)
+    z = (np.asarray(posterior.positions, np.float64) - mean) @ whiten
+    groups = np.stack([z[np.asarray(posterior.population) == p] for p in range(16)])
+    assert_zero(groups.mean(axis=1))
+    assert np.abs((groups**2).mean(axis=(0, 1)) - 1.0).max() < 0.2
+
+
+def smc_takes_proposals_for_what_they_are(smc: ModuleType) -> None:
+    """Starts from a density that is off leave the evidence unbiased."""
+    args, mean, _, evidence = problem()
+    config = smc.TemperedSMCConfig(populations=16, particles=48, start_particles=192, evidence_power=0.0)
+    shape = (16, 192, DIM)
+    a, b = jax.random.split(jax.random.key(3))
+    x = jax.random.normal(a, shape)
+    centre = jnp.asarray(mean, jnp.float32) + 0.4
+    q = jnp.where(jax.random.uniform(b, (*shape[:2], 1)) < 0.5, centre + 0.8 * x, x)
+
+    def log_normal(x):
+        return -0.5 * jnp.sum(x**2 + jnp.log(2 * jnp.pi), axis=-1)
+
+    log_q = jnp.logaddexp(log_normal(q), log_normal((q - centre) / 0.8) - DIM * np.log(0.8)) + np.log(0.5)
+    posterior = smc.tempered_smc(jax.random.key(0), linear, args, DIM, config, initial=(q, log_q))
+    assert_zero(np.exp(np.asarray(posterior.diagnostics.log_evidences, np.float64) - evidence) - 1.0)
+
+
+def resampling_gives_each_its_due(resampling: ModuleType) -> None:
+    """Each particle is copied count x weight times, up to rounding, and a dead one never."""
+    rng = np.random.default_rng(0)
+    for seed in range(10):
+        log_w = np.where(rng.random(100) < 0.3, -np.inf, 3 * rng.normal(size=100))
+        w = np.exp(log_w) / np.exp(log_w).sum()
+        index = resampling.resample(jax.random.key(seed), jnp.asarray(log_w, jnp.float32), 64)
+        counts = np.bincount(index, minlength=100)
+        assert counts.sum() == 64 and len(counts) == 100
+        assert np.all(np.abs(counts - 64 * w) < 1 + 1e-4) and np.all(counts[w == 0] == 0)
+
+
+def annealing_keeps_draws_of_its_last_temperatures(hmc: ModuleType) -> None:
+    """The last state of many short chains of the paper's sampler is a draw of the target that it ended at."""
+    args, mean, covariance, _ = problem((30.0, 4.0), beta=1.0)
+    config = hmc.AnnealedHMCConfig(
+        chains=4096, iterations=40, leapfrog_steps=4, s_start=1.0, s_end=0.5, keep=1, tune_iterations=0,
+        step_per_scale=0.5,
+    )  # fmt: skip
+    posterior = hmc.annealed_hmc(jax.random.key(0), linear, args, DIM, config)
+    z = (np.asarray(posterior.positions, np.float64) - mean) @ np.linalg.cholesky(np.linalg.inv(covariance))
+    assert_zero(z)
+    assert_zero(z**2 - 1.0)
+
+
+def vi_s_bound_is_the_evidence_at_the_posterior(vi: ModuleType) -> None:
+    """log p(z) + l(z) - log q(z) is the log-evidence of every draw where q is the posterior."""
+    precision, peak = jnp.array([9.0, 4.0, 0.5]), jnp.array([1.0, -0.5, 2.0])
+
+    def likelihood(_, q):
+        return -0.5 * jnp.sum(precision * (q - peak) ** 2, axis=-1)
+
+    best = vi.Gaussian(precision * peak / (1 + precision), -0.5 * jnp.log1p(precision))
+    noise = jax.random.normal(jax.random.key(0), (64, 3))
+    evidence = jnp.sum(-0.5 * jnp.log1p(precision) - 0.5 * precision / (1 + precision) * peak**2)
+    np.testing.assert_allclose(vi.elbo_terms(best, likelihood, None, noise), evidence, atol=1e-4)
+
+
+def the_encoder_s_density_is_the_one_it_draws_from(proposal: ModuleType) -> None:
+    """E_q[p / q] = 1 over the proposal's own draws, p the prior, through a flow that stretches space."""
+    model = ProbNeRF(PRESETS["tiny"], jax.random.key(2))
+    leaves, tree = jax.tree.flatten(model.flow)
+    keys = jax.random.split(jax.random.key(5), len(leaves))
+    leaves = [
+        a + 0.15 * jax.random.normal(k, a.shape) if jnp.issubdtype(a.dtype, jnp.floating) else a
+        for k, a in zip(keys, leaves, strict=True)
+    ]
+    model = eqx.tree_at(lambda m: m.flow, model, jax.tree.unflatten(tree, leaves))
+    size = model.preset.image_size
+    picture = proposal.Picture(
+        jnp.full((size, size, 3), 0.5), jnp.full((size, size), 4.0), jnp.zeros((size, size)),
+        jnp.eye(4).at[:3, 3].set(jnp.array([0.0, 0.0, -4.0])), jnp.asarray(0.35),
+    )  # fmt: skip
+    likelihood = Likelihood(Lattice(8), sample_pose=False)
+    q, log_q = proposal.propose(
+        jax.random.key(0), model, likelihood, picture, jnp.zeros(5), 1, 32768, prior_share=0.05, flatten=0.05
+    )
+    log_p = -0.5 * jnp.sum(q**2 + jnp.log(2 * jnp.pi), axis=-1)
+    ratio = np.exp(np.asarray(log_p - log_q, np.float64))[0]
+    assert ratio.std() > 0.1
+    # eight starts share a pose, which here is known: all are independent
+    assert_zero(ratio - 1.0)

@@ -1,0 +1,121 @@
+"""Every sampler obeys its laws, and a careless edit of it does not: the laws are sharp enough to tell."""
+
+from collections.abc import Callable
+from types import ModuleType
+
+import pytest
+
+from probnerf import hmc, proposal, resampling, smc
+from probnerf.baselines import vi
+from tests.probnerf import laws
+
+LAWS = [
+    (laws.hmc_leaves_its_target_alone, hmc),
+    (laws.smc_finds_evidence_and_moments, smc),
+    (laws.resampling_gives_each_its_due, resampling),
+    (laws.smc_takes_proposals_for_what_they_are, smc),
+    (laws.annealing_keeps_draws_of_its_last_temperatures, hmc),
+    (laws.vi_s_bound_is_the_evidence_at_the_posterior, vi),
+    (laws.the_encoder_s_density_is_the_one_it_draws_from, proposal),
+]
+
+
+@pytest.mark.parametrize(("law", "module"), LAWS, ids=[law.__name__ for law, _ in LAWS])
+def test_the_law_holds(law: Callable, module: ModuleType) -> None:
+    law(module)
+
+
+def smc_with(edited: ModuleType) -> ModuleType:
+    """Tempered SMC that draws its names from an edited module."""
+    made = laws.mutant("probnerf.smc")
+    for name in ("hmc_step", "Target", "choose", "next_beta"):
+        if hasattr(edited, name):
+            setattr(made, name, getattr(edited, name))
+    return made
+
+
+def hmc_edited(*edits: tuple[str, str]) -> Callable[[], ModuleType]:
+    return lambda: laws.mutant("probnerf.hmc", *edits)
+
+
+def smc_edited(*edits: tuple[str, str]) -> Callable[[], ModuleType]:
+    return lambda: laws.mutant("probnerf.smc", *edits)
+
+
+def resampling_edited(*edits: tuple[str, str]) -> Callable[[], ModuleType]:
+    return lambda: smc_with(laws.mutant("probnerf.resampling", *edits))
+
+
+MUTATIONS = {
+    "an accept test without the momentum": (
+        laws.hmc_leaves_its_target_alone,
+        hmc_edited(("(end.position + start.position) + (v1 - v0) * (v1 + v0)", "(end.position + start.position)")),
+    ),
+    "an accept test at another temperature": (
+        laws.hmc_leaves_its_target_alone,
+        hmc_edited(("beta * (end.log_likelihood - start.log_likelihood)", "end.log_likelihood - start.log_likelihood")),
+    ),
+    "every proposal accepted": (
+        laws.hmc_leaves_its_target_alone,
+        hmc_edited(("accepted = uniform[1] < acceptance", "accepted = ~divergent")),
+    ),
+    "the momentum of the iteration before": (
+        laws.hmc_leaves_its_target_alone,
+        hmc_edited(("jax.random.normal(momentum_key, state.position.shape)", "0.7 * state.position")),
+    ),
+    "a turn without the sine's sign": (
+        laws.hmc_leaves_its_target_alone,
+        hmc_edited(("return cosine * q + sine * v, cosine * v - sine * q", "return cosine * q + sine * v, cosine * v")),
+    ),
+    "an un-annealed chain": (
+        laws.annealing_keeps_draws_of_its_last_temperatures,
+        hmc_edited(("(config.s_end / scale) ** 2, base * scale", "(config.s_end / config.s_start) ** 2, base * scale")),
+    ),
+    "resampling off by one": (
+        laws.resampling_gives_each_its_due,
+        lambda: laws.mutant("probnerf.resampling", ('u, side="right")', 'u, side="right") + 1')),
+    ),
+    "resampling with one number for all": (
+        laws.resampling_gives_each_its_due,
+        lambda: laws.mutant(
+            "probnerf.resampling",
+            ("(jnp.arange(count) + jax.random.uniform(key)) / count", "jnp.full(count, jax.random.uniform(key))"),
+        ),
+    ),
+    "an un-annealed importance step": (
+        laws.smc_finds_evidence_and_moments,
+        resampling_edited(("return new, weights(new - beta), sizes[index]", "return new, weights(new), sizes[index]")),
+    ),
+    "an evidence without its normaliser": (
+        laws.smc_finds_evidence_and_moments,
+        smc_edited(("logsumexp(log_w, axis=1) - np.log(size), state", "logsumexp(log_w, axis=1), state")),
+    ),
+    "moves at the temperature of the next stage's weights": (
+        laws.smc_finds_evidence_and_moments,
+        smc_edited(
+            ("args, state.beta[:, None], state.metric)", "args, jnp.ones_like(state.beta)[:, None], state.metric)")
+        ),
+    ),
+    "starts weighed as if the prior had drawn them": (
+        laws.smc_takes_proposals_for_what_they_are,
+        smc_edited(("return q0, log_prior(q0) - log_q0", "return q0, jnp.zeros_like(log_q0)")),
+    ),
+    "a bound without the width of q": (
+        laws.vi_s_bound_is_the_evidence_at_the_posterior,
+        lambda: laws.mutant("probnerf.baselines.vi", ("** 2 + fixed.log_std, axis", "** 2, axis")),
+    ),
+    "a density without the flow's Jacobian": (
+        laws.the_encoder_s_density_is_the_one_it_draws_from,
+        lambda: laws.mutant(
+            "probnerf.proposal", ("precision * (z - mean) ** 2) + log_det", "precision * (z - mean) ** 2)")
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MUTATIONS)
+def test_a_careless_edit_breaks_a_law(name: str) -> None:
+    law, edited = MUTATIONS[name]
+    module = edited()  # fails here where the source has moved on
+    with pytest.raises(AssertionError):
+        law(module)
