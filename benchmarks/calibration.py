@@ -174,7 +174,7 @@ def main(
                 if view is None:
                     continue
                 given = answers(view, loaded, config, rivals, seed, None, 240)
-                lines = {
+                answered = {
                     m: {**own, "method": m, "object": number, **judged(view, a, rate, seed)} for m, a in given.items()
                 }
                 for line in answered.values():

@@ -23,6 +23,7 @@ from benchmarks.scene import GRID, VesselPicture, base_rate, vessel_view
 from benchmarks.score import BOXES, Answer, random_boxes, score
 from benchmarks.summary import interval, say, table
 from perception.controller import ControllerConfig, estimate
+from perception.query import CAUTION
 from perception.source import Frame
 from probnerf.families.tabletop import TEST_SEEDS
 from probnerf.metrics import falsely_free, paired_interval, scored_voxels
@@ -137,14 +138,16 @@ def _infer(name: str) -> Callable[[ControllerConfig, float], ControllerConfig]:
 
 def _particles(config: ControllerConfig, amount: float) -> ControllerConfig:
     smc = config.infer.smc
-    size = {n: max(2, int(getattr(smc, n) * amount)) for n in ("particles", "start_particles")}
-    return replace(config, infer=replace(config.infer, smc=replace(smc, **size)))
+    smc = replace(
+        smc, particles=max(2, int(smc.particles * amount)), start_particles=max(2, int(smc.start_particles * amount))
+    )
+    return replace(config, infer=replace(config.infer, smc=smc))
 
 
 def _rays(config: ControllerConfig, amount: float) -> ControllerConfig:
-    names = ("colour_rays", "free_rays", "occluder_rays")
-    size = {n: max(1, int(getattr(config.observe, n) * amount)) for n in names}
-    return replace(config, observe=replace(config.observe, **size))
+    o = config.observe
+    colour, free, occluder = (max(1, int(n * amount)) for n in (o.colour_rays, o.free_rays, o.occluder_rays))
+    return replace(config, observe=replace(o, colour_rays=colour, free_rays=free, occluder_rays=occluder))
 
 
 AXES = (
@@ -199,8 +202,10 @@ def look(
     p = h.p_occupied
     answer = Answer(coarsen(h.solid, GRID), h.weights, found.seconds)
     if h.out_of_model:  # what a query answers: half the weight on "all that is unseen is occupied"
-        hidden = ~h.seen.reshape(GRID, 2, GRID, 2, GRID, 2).all(axis=(1, 3, 5))
-        answer = Answer(np.concatenate([answer.shapes, hidden[None]]), np.append(0.5 * h.weights, 0.5), found.seconds)
+        seen = h.seen.reshape(GRID, 2, GRID, 2, GRID, 2)
+        hidden = np.asarray(np.logical_not(seen.all(axis=(1, 3, 5))))
+        shapes = np.concatenate([answer.shapes, hidden[np.newaxis]])
+        answer = Answer(shapes, np.append((1 - CAUTION) * h.weights, CAUTION), found.seconds)
     judged = score(view, answer, rate, random_boxes(scored, BOXES, rng), rng)
     broken = "" if np.isfinite(p).all() and np.isfinite(judged.values["hidden_nll"]) else "not finite"
     return Seen(judged.values, h.out_of_model, broken, judged.p_free, judged.occupied)
@@ -245,7 +250,7 @@ def main(
 
 
 def _nll(seen: Sequence[Seen]) -> Float[np.ndarray, "n"]:
-    return np.array([np.nan if s.values is None else s.values["hidden_nll"] for s in seen])
+    return np.array([np.nan if s.values is None else s.values["hidden_nll"] for s in seen], np.float64)
 
 
 def _falsely_free(seen: Sequence[Seen]) -> float:
