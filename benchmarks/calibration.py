@@ -254,7 +254,7 @@ def _draw(lines: list[Line], path: Path) -> None:
         bottom.plot(at, np.mean(ranks[:, None] <= at, axis=0) - at, color=COLOURS[POSTERIOR])
         bottom.axhline(0.0, color="k", linewidth=0.6)
         bottom.set(xlabel="rank of a box's true volume", ylabel="share below, less uniform", title="ranks, posterior")
-        bottom.legend(fontsize=8)
+        bottom.legend(fontsize=8, loc="upper left")
     axes[0, 0].legend(fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)

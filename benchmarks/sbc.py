@@ -62,7 +62,7 @@ def _prior() -> Model:
 THOROUGH = TemperedSMCConfig(populations=2, particles=96, start_particles=768, moves=4, final_stages=2, keep=2)
 SHIPPED = replace(InferConfig().smc, evidence_power=1.0)
 CONDITIONS = (
-    Condition("cylinder", CylinderModel, TemperedSMCConfig(), lattice=16),
+    Condition("cylinder", CylinderModel, TemperedSMCConfig(), columns=6, rows=5, lattice=12),
     Condition("shipped prior, pose known", _prior, THOROUGH, pose=False),
     Condition("shipped prior", _prior, THOROUGH),
     Condition("shipped prior, delta", _prior, THOROUGH, delta=True),

@@ -1,0 +1,57 @@
+"""Faults are what they say and leave a frame alone at none; the worst allowed outcome is a flagged answer."""
+
+import numpy as np
+import pytest
+
+from benchmarks.calibration import any_view
+from benchmarks.scene import base_rate, vessel_view
+from benchmarks.stability import AXES, FIRST, Axis, look, noise_frame, occlusion
+from perception.controller import ControllerConfig
+from perception.source import Frame
+from probnerf.families.tabletop import TEST_SEEDS
+from probnerf.store import load_prior
+
+FAULTS = [axis for axis in AXES if axis.fault is not None]
+CONFIGURED = [axis for axis in AXES if axis.configured is not None]
+
+
+@pytest.fixture(scope="module")
+def frame() -> Frame:
+    return vessel_view(any_view(TEST_SEEDS[FIRST])).frame
+
+
+def same(a: Frame, b: Frame) -> bool:
+    pairs = ((a.rgb, b.rgb), (a.depth, b.depth), (a.label, b.label), (a.camera.K, b.camera.K))
+    return all(np.array_equal(x, y, equal_nan=x.dtype.kind == "f") for x, y in pairs)
+
+
+@pytest.mark.parametrize("axis", FAULTS, ids=[a.name for a in FAULTS])
+def test_a_fault_of_no_size_is_none_and_a_larger_one_is_larger(axis: Axis, frame: Frame) -> None:
+    assert same(axis.fault(frame, axis.amounts[0]), frame)
+    changed = [axis.fault(frame, amount) for amount in axis.amounts[1:]]
+    assert not any(same(f, frame) for f in changed)
+    assert all(f.rgb.shape == frame.rgb.shape and f.depth.shape == frame.depth.shape for f in changed)
+
+
+@pytest.mark.parametrize("axis", CONFIGURED, ids=[a.name for a in CONFIGURED])
+def test_how_it_ships_is_the_first_amount(axis: Axis) -> None:
+    assert axis.configured(ControllerConfig(), axis.amounts[0]) == ControllerConfig()
+    assert all(axis.configured(ControllerConfig(), amount) != ControllerConfig() for amount in axis.amounts[1:])
+
+
+def test_an_occluder_hides_the_share_that_it_should(frame: Frame) -> None:
+    whole = np.count_nonzero(frame.label == 1)
+    for amount in (0.3, 0.6, 0.8):
+        left = np.count_nonzero(occlusion(frame, amount).label == 1)
+        assert left / whole == pytest.approx(1.0 - amount, abs=0.03)
+
+
+@pytest.mark.slow
+def test_a_shape_that_is_none_is_flagged_and_nothing_breaks() -> None:
+    prior, rate, picture = load_prior(None), base_rate(128), any_view(TEST_SEEDS[FIRST])
+    whole = look(picture, AXES[0], 0.0, prior, rate, 0)
+    assert whole.values is not None and not whole.flagged
+    noise = look(picture, Axis("noise", (0.0, 1.0), noise_frame), 1.0, prior, rate, 0)
+    assert noise.flagged and not noise.broken
+    hidden = look(picture, Axis("occluded", (0.0, 0.8), occlusion), 0.8, prior, rate, 0)
+    assert not hidden.broken and (hidden.flagged or hidden.values["hidden_nll"] > 0.0)
