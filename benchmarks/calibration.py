@@ -79,7 +79,7 @@ def _half(seed: int) -> VesselPicture | None:
     return half_hidden(seed, next(carton_seeds(range(seed + 1, seed + 1000))))
 
 
-# which seeds, counted from the end of the test seeds' first half so that conditions share no object, and the picture
+# of each condition: where among the test seeds it begins, so that conditions share no object, and its picture
 SORTS: dict[str, tuple[int, Callable[[int], VesselPicture | None]]] = {
     ANY: (0, any_view),
     HALF: (2000, _half),

@@ -76,16 +76,12 @@ def _settings(condition: Condition) -> InferConfig:
     return replace(InferConfig(), reach=1e6, power=1.0, sample_delta=condition.delta, lattice=condition.lattice)
 
 
-@jax.jit
-def _solid(model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "5"]):
-    return opacity_grids(model, likelihood, positions, pose_sigma, jnp.ones((GRID,) * 3, bool))
-
-
 def statistics(
     model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "5"], voxel: int
 ) -> dict[str, Float[np.ndarray, "s"]]:
     """Of each position's shape; `voxel` counts those of the far half, which the camera at +x looks at last."""
-    shapes = solid(np.asarray(_solid(model, likelihood, positions, pose_sigma))).reshape(len(positions), -1)
+    opacity = opacity_grids(model, likelihood, positions, pose_sigma, jnp.ones((GRID,) * 3, bool))
+    shapes = solid(np.asarray(opacity)).reshape(len(positions), -1)
     far = np.flatnonzero(voxel_centres(GRID)[..., 0].ravel() < 0.0)
     found = {
         "volume": shapes.sum(axis=1),
@@ -132,7 +128,7 @@ def main(out: Path, quick: bool = False, n: int = 200, conditions: str = "") -> 
 
     Args:
         n: draws of each condition
-        conditions: only those whose name holds one of these, separated by semicolons
+        conditions: only these, by name, separated by semicolons
     """
     n = min(n, 20) if quick else n
     wanted = [c.strip() for c in (conditions or ("cylinder" if quick else "")).split(";") if c.strip()]

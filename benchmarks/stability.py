@@ -259,10 +259,7 @@ def _falsely_free(seen: Sequence[Seen]) -> float:
 
 def _line(seen: Sequence[Seen]) -> str:
     flagged, broken = np.mean([s.flagged for s in seen]), [s.broken for s in seen if s.broken]
-    return (
-        f"{np.nanmean([*_nll(seen), *([np.nan] if len(seen) else [0.0])]):.3f} nats, flagged {flagged:.2f}"
-        + "".join(f"; BROKEN: {b}" for b in broken)
-    )
+    return f"{interval(_nll(seen)).mean:.3f} nats, flagged {flagged:.2f}" + "".join(f"; BROKEN: {b}" for b in broken)
 
 
 def _rows(axes: Sequence[Axis], found: dict[str, list[list[Seen]]]) -> list[Row]:

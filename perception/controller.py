@@ -4,8 +4,8 @@ A level is an amount of model: particles divided by a number. The controller beg
 to publish after every stage. Where the shapes of a level leave too many pixels unexplained (a posterior-predictive
 check) or the Monte Carlo error of the answer is above the tolerance, the next level begins, afresh: what a small
 population has dropped a larger one could not find again. At the last level further independent populations may join.
-By default there is one level: a third of its particles gave as small an error but no handle behind the shipped mug, and
-no check of the answer itself told (`farside replay` with `controller.levels: [3, 1]`).
+By default there is one level: no check of the answer told where a third of its particles was too few (that third is
+"smallest level" in `farside bench frontier`; `controller.levels: [3, 1]` begins with it).
 
 Lattice and rays are the same at every level: with half of both, shapes were worse on easy scenes as on hard ones, and
 no check told where (`farside bench frontier` has a coarse lattice among its levers).
