@@ -231,6 +231,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "farside"
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    # Only what is fatal: jaxlib 0.10.1 takes its own kept programs for another machine's, at every start.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     # One device per core, to share particles out; a power of two divides their number.
     os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(1 << min((os.cpu_count() or 1).bit_length() - 1, 4)))
     if not args or args[0] not in COMMANDS:
