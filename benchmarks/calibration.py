@@ -10,7 +10,8 @@ Test seeds, the whole path from RGB-D frame to hypotheses, yaw unknown. Conditio
 
 Measures: as `farside bench hidden`, over unseen voxels whose training-set frequency lies in (0.02, 0.98), smoothed
 alike. hidden_ece here pools the voxels of all objects (15 bins); voxels of one object err together, so that its 95%
-interval is a bootstrap over objects. mean_iou and best_of_8_iou are of whole shapes.
+interval is a bootstrap over objects. mean_iou and best_of_8_iou are of whole shapes. wrong_at_R: of the random unseen
+boxes with p_free of 1 - R or more, the share that is truly occupied; free_at_R: the share of all boxes that they are.
 
 Results are appended to a file, object by object, and what is there is not made again.
 """
@@ -25,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -64,6 +65,7 @@ from probnerf.store import load_prior
 RESULTS = Path(__file__).with_suffix(".jsonl")
 ANY, HALF, HANDLE = "any view", "half hidden", "handle hidden"
 PER_OBJECT = {"hidden_nll": "nats", "hidden_brier": "", "mean_iou": "", "best_of_8_iou": "", "seconds": "s"}
+RISKS = (0.02, 0.05, 0.1, 0.2)
 COLOURS = dict(zip(METHODS, ("tab:blue", "tab:gray", "tab:orange", "tab:red"), strict=True))
 
 
@@ -203,6 +205,16 @@ def pooled_ece(lines: list[Line], resamples: int = 400) -> tuple[float, float, f
     return error(np.arange(len(lines))), float(low), float(high)
 
 
+def called_free(p_free: Float[np.ndarray, "n"], occupied: Bool[np.ndarray, "n"]) -> dict[str, float]:
+    """What abstaining buys: of the boxes that are called free at each risk, the share that is not; and their share."""
+    found = {}
+    for risk in RISKS:
+        called = p_free >= 1.0 - risk
+        found[f"wrong_at_{risk:g}"] = float(occupied[called].mean()) if called.any() else float("nan")
+        found[f"free_at_{risk:g}"] = float(called.mean())
+    return found
+
+
 def _rows(lines: list[Line]) -> list[Row]:
     rows, cells = [], []
     for condition in [c for c in SORTS if any(line["condition"] == c for line in lines)]:
@@ -220,6 +232,7 @@ def _rows(lines: list[Line]) -> list[Row]:
                 "coverage90": coverage(ranks), "ks": ks_distance(ranks),
                 "falsely_free": falsely_free(p_free, occupied.astype(bool)),
             }  # fmt: skip
+            pooled |= called_free(p_free, occupied.astype(bool))
             rows += [Row("calibration", method, condition, k, float(v), "", len(own)) for k, v in pooled.items()]
             gap = paired_interval(*(np.array([x["hidden_nll"] for x in by[m]]) for m in (method, POSTERIOR)))
             for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
@@ -231,9 +244,19 @@ def _rows(lines: list[Line]) -> list[Row]:
                 f"{condition} ({len(own)})", method, *(f"{mean[m]:.3f}" for m in PER_OBJECT),
                 f"{ece[0]:.3f} ({ece[1]:.3f}..{ece[2]:.3f})", f"{pooled['coverage90']:.3f}",
                 f"{pooled['falsely_free']:.3f}",
+                f"{pooled['wrong_at_0.05']:.3f} of {pooled['free_at_0.05']:.2f}",
                 "" if method == POSTERIOR else f"{gap.low:+.3f}..{gap.high:+.3f}",
             ])  # fmt: skip
-    header = ("condition", "method", *PER_OBJECT, "ece, pooled", "coverage90", "falsely_free", "nll above posterior's")
+    header = (
+        "condition",
+        "method",
+        *PER_OBJECT,
+        "ece, pooled",
+        "coverage90",
+        "falsely_free",
+        "wrong at 0.05",
+        "nll above posterior's",
+    )
     table("Unseen space", header, cells)
     return rows
 

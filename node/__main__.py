@@ -98,7 +98,7 @@ def _query(args: Sequence[str]) -> int:
 
     box, points = options.box, options.points
     region = Box(box[:3], box[3:]) if box is not None else read_points(points)  # type: ignore[arg-type]
-    answer(options.file, region, options.frame, options.json, Console())
+    answer(options.file, region, options.frame, options.risk, options.json, Console())
     return 0
 
 

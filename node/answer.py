@@ -9,21 +9,25 @@ from rich.table import Table
 from perception.hypotheses import FrameName
 from perception.query import Box, Points, QueryResult, query
 from perception.store import load_scene
+from perception.verdict import verdict
 
 CM3 = 1e6  # per cubic metre
 
 
-def answer(path: Path, region: Box | Points, frame: FrameName, as_json: bool, out: Console) -> None:
-    """Ask the objects of a hypotheses file or folder about a region and print the answer.
+def answer(path: Path, region: Box | Points, frame: FrameName, risk: float, as_json: bool, out: Console) -> None:
+    """Ask the objects of a hypotheses file or folder about a region and print the answer, with a verdict at `risk`.
 
     Raises FileNotFoundError or ValueError in one line.
     """
     result = query(load_scene(path), region, frame)
+    said = verdict(result, risk)
     if as_json:
-        out.print(json.dumps(result.as_dict(), indent=1), highlight=False, soft_wrap=True, markup=False)
+        out.print(
+            json.dumps({"verdict": said, **result.as_dict()}, indent=1), highlight=False, soft_wrap=True, markup=False
+        )
         return
     table = Table.grid(padding=(0, 2))
-    for name, value in rows(result):
+    for name, value in ((f"verdict at a risk of {risk:g}", said), *rows(result)):
         table.add_row(name, value)
     out.print(table, highlight=False)
     for i, p in enumerate(result.p_occupied or [], start=1):

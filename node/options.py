@@ -127,6 +127,8 @@ class Query:
     """Text file of points, one a line: x y z in metres."""
     frame: Literal["object", "camera", "world"] = "object"
     """Frame of the question. object: z up, x to the camera, the plane under the origin; camera: x right, y down."""
+    risk: float = 0.05
+    """Chance of being wrong at which it is still called free or occupied; else the verdict is "unsure"."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print JSON instead of a table."""
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.calibration import pooled_ece
+from benchmarks.calibration import called_free, pooled_ece
 from benchmarks.sbc import CONDITIONS, STATISTICS, outside, ranks_of
 from probnerf.metrics import ECE_BINS, uniform_band
 
@@ -17,6 +17,14 @@ def test_a_pooled_error_lets_objects_that_err_apart_cancel() -> None:
     assert pooled_ece([line(1.0), line(0.0)])[0] == 0.0
     error, low, high = pooled_ece([line(0.8)] * 9 + [line(0.5)])
     assert error == pytest.approx(0.27) and low <= error <= high
+
+
+def test_what_is_called_free_at_a_risk() -> None:
+    found = called_free(np.array([1.0, 0.96, 0.91, 0.0]), np.array([False, True, False, True]))
+    assert (found["wrong_at_0.05"], found["free_at_0.05"]) == (0.5, 0.5)
+    assert (found["wrong_at_0.02"], found["free_at_0.02"]) == (0.0, 0.25)
+    assert found["wrong_at_0.1"] == pytest.approx(1 / 3)
+    assert np.isnan(called_free(np.zeros(2), np.ones(2, bool))["wrong_at_0.2"])
 
 
 @pytest.mark.parametrize("n", [20, 200])

@@ -225,6 +225,7 @@ def test_a_bad_frame_folder_is_named(
         (["query", "{mug}"], "needs either --box X0 Y0 Z0 X1 Y1 Z1 or --points FILE.xyz"),
         (["query", "{mug}", *BOX, "--points", "p.xyz"], "needs either --box"),
         (["query", "{mug}", "--box", "0", "0", "0", "1", "-1", "1"], "the box is empty: y1 = -1 is not greater"),
+        (["query", "{mug}", *BOX, "--risk", "0.6"], "risk is 0.6; give the chance of being wrong"),
         (["query", "{mug}", "--points", "p.xyz"], "p.xyz: no such file; give a text file"),
         (["query", "{mug}", *BOX, "--frame", "world"], "without the camera's pose in the world"),
         (["view", "{text}"], "notes.txt is not a hypotheses file"),
@@ -322,6 +323,7 @@ def test_query_answers_in_json_and_in_words(tmp_path: Path, frame: Frame, capsys
     keys = {"p_free", "p_free_se", "volume_m3", "unseen_fraction", "outside_fraction", "entropy_nats"}
     assert keys | {"effective_hypotheses"} <= set(answer) and "p_occupied" not in answer
     assert set(answer["volume_m3"]) == {"q05", "q50", "q95"}
+    assert answer["verdict"] == "unsure"  # two hypotheses tell no chance of 1 in 20
     assert answer["p_free"] == 0.0 or 0 <= answer["p_free"] <= 1
     points = tmp_path / "p.xyz"
     low = -0.7 * MUG.half_extent  # in the mug's floor
@@ -331,4 +333,5 @@ def test_query_answers_in_json_and_in_words(tmp_path: Path, frame: Frame, capsys
     assert answer["p_occupied"] == [pytest.approx(1.0), 0.0] and answer["outside_fraction"] == 0.5
     assert main(["query", str(path), "--points", str(points), "--frame", "camera"]) == 0
     said = capsys.readouterr().out
-    assert "all of it is free" in said and "point 2: occupied with probability" in said
+    assert "verdict at a risk of 0.05" in said and "all of it is free" in said
+    assert "point 2: occupied with probability" in said

@@ -7,7 +7,8 @@ import pytest
 
 from perception.hypotheses import Hypotheses
 from perception.observe import ObjectFrame
-from perception.query import CAUTION, Box, Points, Swept, query, read_points
+from perception.query import CAUTION, Box, Points, QueryResult, Swept, query, read_points
+from perception.verdict import verdict
 from probnerf.occupancy import voxel_centres
 
 GRID, HALF_EXTENT = 32, 0.16
@@ -296,3 +297,28 @@ def test_a_turned_thin_box_finds_its_voxels(mug):
 def test_swept_boxes_are_checked(T, size, complaint):
     with pytest.raises(ValueError, match=complaint):
         Swept(T, size)
+
+
+@pytest.mark.parametrize(
+    ("p_free", "n", "outside", "risk", "said"),
+    [
+        (1.0, 48.0, 0.0, 0.05, "free"),
+        (1.0, 48.0, 0.1, 0.05, "unsure"),  # a part of it was never looked at
+        (1.0, 10.0, 0.0, 0.05, "unsure"),  # ten that agree do not tell a chance of 1 in 20
+        (1.0, 10.0, 0.0, 0.1, "free"),
+        (0.97, 1000.0, 0.0, 0.05, "free"),
+        (0.94, 1000.0, 0.0, 0.05, "unsure"),
+        (0.0, 48.0, 0.5, 0.05, "occupied"),  # whatever the rest of it is
+        (0.0, 48.0, 0.0, 0.01, "unsure"),
+        (0.5, 1000.0, 0.0, 0.49, "unsure"),
+    ],
+)
+def test_a_verdict_abstains_where_the_risk_is_larger(p_free, n, outside, risk, said) -> None:
+    result = QueryResult(p_free, 0.0, {}, 0.0, outside, 0.0, n, 0.0)
+    assert verdict(result, risk) == said
+
+
+@pytest.mark.parametrize("risk", [0.0, 0.5, -1.0, float("nan")])
+def test_a_risk_that_is_none_is_refused(risk: float) -> None:
+    with pytest.raises(ValueError, match="above 0 and below"):
+        verdict(QueryResult(1.0, 0.0, {}, 0.0, 0.0, 0.0, 48.0, 0.0), risk)
