@@ -103,13 +103,13 @@ def main(
             try:
                 picture = any_view(number)
                 view = vessel_view(picture)
-                lines = _measured(Tracker(loaded, config, seed=seed), picture, view, rate, seed)
+                answered = _measured(Tracker(loaded, config, seed=seed), picture, view, rate, seed)
             except ValueError:  # outside perception's range of sizes, too few pixels, or out of the second picture
                 continue
             found += 1
-            for who, line in lines.items():
+            for who, line in answered.items():
                 append_line(results, {**common, "method": who, "object": number, **line})
-            say(f"{found}, object {number}: " + ", ".join(f"{w} {v['hidden_nll']:.3f}" for w, v in lines.items()))
+            say(f"{found}, object {number}: " + ", ".join(f"{w} {v['hidden_nll']:.3f}" for w, v in answered.items()))
     lines = newest(read_lines(results), loaded.hash, seed)
     if not lines:
         raise ValueError(f"{results} has no results of this prior; leave --only-chart")
