@@ -11,10 +11,14 @@ and no shape that the prior does not know: what is wrong here is the sampler's, 
 
 outside: how far the ranks' distribution function leaves the band that 95% of uniform samples stay in as a whole
 (`metrics.uniform_band`), 0 where it stays inside. coverage90: share of truths in the central 90%.
+
+Ranks are appended to a file, draw by draw, and what is there is not made again.
 """
 
+import json
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 
 import jax
@@ -23,6 +27,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 
+from benchmarks.results import Line, append_line, key, read_lines
 from benchmarks.rows import Row
 from benchmarks.summary import say, table
 from probnerf.analytic import draw_pixels, grid_of_rays
@@ -35,6 +40,7 @@ from probnerf.smc import TemperedSMCConfig, tempered_smc
 from probnerf.store import load_prior
 from probnerf.types import Posterior
 
+RESULTS = Path(__file__).with_suffix(".jsonl")
 GRID = 24
 POSE_SIGMA = (0.08, 0.08, 0.06, 0.02, 0.03)  # of perception's usual widths, cube units
 STATISTICS = ("volume", "hidden", "voxel", "yaw", "log_likelihood")
@@ -123,34 +129,63 @@ def _value(args, positions):
     return log_likelihood(args, positions)
 
 
-def main(out: Path, quick: bool = False, n: int = 200, conditions: str = "") -> list[Row]:
+def identity(condition: Condition, prior: str) -> Line:
+    """What makes a draw of this condition the same one, but for its number."""
+    told = {"sampler": asdict(condition.sampler), "infer": asdict(_settings(condition)), "pose": condition.pose}
+    told |= {"pixels": [condition.columns, condition.rows], "grid": GRID, "draws": DRAWS, "widths": POSE_SIGMA}
+    digest = sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()[:12]
+    same = {"method": "tempered_smc", "condition": condition.name, "settings": {"digest": digest}, "seed": 0}
+    return {"prior": "" if condition.model is CylinderModel else prior, **same}
+
+
+def main(
+    out: Path,
+    quick: bool = False,
+    n: int = 200,
+    conditions: str = "",
+    results: Path = RESULTS,
+    only_chart: bool = False,
+) -> list[Row]:
     """Simulation-based calibration of tempered SMC: ranks of the truth in draws from the model itself.
 
     Args:
         n: draws of each condition
         conditions: only these, by name, separated by semicolons
+        results: file that ranks are appended to, and read from
+        only_chart: draw what the file holds
     """
-    n = min(n, 20) if quick else n
+    if quick:
+        n, results = min(n, 20), out / "sbc.jsonl" if results == RESULTS else results
     wanted = [c.strip() for c in (conditions or ("cylinder" if quick else "")).split(";") if c.strip()]
     chosen = [c for c in CONDITIONS if not wanted or c.name in wanted]
     if not chosen:
         raise ValueError(f"no condition {conditions!r}; there are: {'; '.join(c.name for c in CONDITIONS)}")
+    done = {key(line): line["ranks"] for line in read_lines(results)}
+    prior = load_prior(None).hash
     found: dict[str, dict[str, np.ndarray]] = {}
     for condition in chosen:
-        model, ranks = condition.model(), []
+        model, ranks, same = condition.model(), [], identity(condition, prior)
         for seed in range(n):
-            one, posterior = ranks_of(condition, model, seed)
-            ranks.append(one)
-            if (seed + 1) % 20 == 0:
-                say(f"{condition.name}: {seed + 1} of {n} draws ({posterior.result})")
-        found[condition.name] = {name: np.array([r[name] for r in ranks]) for name in ranks[0]}
+            line = {**same, "object": seed}
+            if key(line) not in done and not only_chart:
+                one, posterior = ranks_of(condition, model, seed)
+                done[key(line)] = {name: round(rank, 4) for name, rank in one.items()}
+                append_line(results, {**line, "ranks": done[key(line)], "result": posterior.result})
+                if (seed + 1) % 20 == 0:
+                    say(f"{condition.name}: {seed + 1} of {n} draws ({posterior.result})")
+            if key(line) in done:
+                ranks.append(done[key(line)])
+        if ranks:
+            found[condition.name] = {name: np.array([r[name] for r in ranks]) for name in ranks[0]}
+    if not found:
+        raise ValueError(f"{results} has no ranks of these conditions; leave --only-chart")
     rows, lines = [], []
     for name, by in found.items():
         for statistic, u in by.items():
             values = {"outside": outside(u), "ks": ks_distance(u), "coverage90": coverage(u)}
             rows += [Row("sbc", name, statistic, metric, value, "", len(u)) for metric, value in values.items()]
-            lines.append([name, statistic, *(f"{v:.3f}" for v in values.values())])
-    table(f"Ranks of the truth, {n} draws", ("condition", "statistic", "outside", "ks", "coverage90"), lines)
+            lines.append([name, str(len(u)), statistic, *(f"{v:.3f}" for v in values.values())])
+    table("Ranks of the truth", ("condition", "draws", "statistic", "outside", "ks", "coverage90"), lines)
     _draw(found, out / "sbc.png")
     return rows
 

@@ -1,10 +1,13 @@
 """Calibration's sums: an error pooled over objects, ranks of draws from the model, the band of uniform samples."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from benchmarks.calibration import called_free, pooled_ece
-from benchmarks.sbc import CONDITIONS, STATISTICS, outside, ranks_of
+from benchmarks.results import append_line
+from benchmarks.sbc import CONDITIONS, STATISTICS, identity, main, outside, ranks_of
 from probnerf.metrics import ECE_BINS, uniform_band
 
 
@@ -35,6 +38,18 @@ def test_the_band_holds_as_many_uniform_samples_as_it_says(n: int) -> None:
     stay = np.mean(np.all((share >= low) & (share <= high), axis=1))
     assert 0.93 < stay < 0.985  # counts are whole numbers: it may hold a little more than 95%
     assert outside(drawn[0] ** 3) > 0.05  # ranks that crowd at one end leave it
+
+
+def test_ranks_that_are_there_are_not_made_again(tmp_path: Path) -> None:
+    kept, ranks = tmp_path / "sbc.jsonl", np.linspace(0.05, 0.95, 4)
+    for number, rank in enumerate(ranks):
+        append_line(kept, {**identity(CONDITIONS[0], "weights"), "object": number, "ranks": {"volume": rank}})
+    rows = main(tmp_path, n=4, conditions="cylinder", results=kept)  # nothing to make
+    assert {r.n for r in rows} == {4} and (tmp_path / "sbc.png").is_file()
+    assert {r.metric: r.value for r in rows}["coverage90"] == 1.0
+    assert len({str(identity(c, "weights")) for c in CONDITIONS}) == len(CONDITIONS)
+    with pytest.raises(ValueError, match="has no ranks of these conditions"):
+        main(tmp_path, n=4, conditions="shipped prior", results=kept, only_chart=True)
 
 
 @pytest.mark.slow
