@@ -39,7 +39,7 @@ from probnerf.occupancy import coarsen
 from probnerf.store import load_prior
 
 RESULTS = Path(__file__).with_suffix(".jsonl")
-FIRST = 6000  # among the test seeds: objects of no other measurement
+FIRST = 8000  # among the test seeds: objects of no other measurement
 NONE, SUGGESTED, RANDOM, FARTHEST = CHOICES = ("first picture alone", "suggested", "random", "farthest")
 COLOURS = dict(zip(CHOICES, ("tab:gray", "tab:blue", "tab:orange", "tab:green"), strict=True))
 STAGES = 240  # at most, a picture

@@ -7,7 +7,7 @@ A measurement NAME is the module `benchmarks/NAME.py`. The first line of its doc
 `farside bench NAME` calls it: every further keyword of `main` has a type and a default and becomes an option of that
 name (`map_steps: int = 300` is `--map-steps`). `quick` asks for the same measurement on a few objects, in a minute.
 `main` shows progress on stderr, draws its picture to `out / "NAME.png"` and writes nothing outside `out`, save the file
-of results that `frontier` adds to; the command prints the table, writes the JSON and names the picture.
+of results that long ones add to; the command prints the table, writes the JSON and names the picture.
 """
 
 import json

@@ -1,11 +1,14 @@
 """Faults are what they say and leave a frame alone at none; the worst allowed outcome is a flagged answer."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from benchmarks.calibration import any_view
+from benchmarks.faults import AXES, Axis, noise_frame, occlusion
 from benchmarks.scene import base_rate, vessel_view
-from benchmarks.stability import AXES, FIRST, Axis, look, noise_frame, occlusion
+from benchmarks.stability import FIRST, Seen, look, main
 from perception.controller import ControllerConfig
 from perception.source import Frame
 from probnerf.families.tabletop import TEST_SEEDS
@@ -46,12 +49,32 @@ def test_an_occluder_hides_the_share_that_it_should(frame: Frame) -> None:
         assert left / whole == pytest.approx(1.0 - amount, abs=0.03)
 
 
+def test_answers_that_are_there_are_not_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[str, float]] = []
+
+    def looked(picture, axis: Axis, amount: float, *_) -> Seen:
+        asked.append((axis.name, amount))
+        return Seen(0.2 + amount, amount > 0.5, "", (0.99, 0.1), (False, True))
+
+    monkeypatch.setattr("benchmarks.stability.look", looked)
+    settings = {"n": 1, "axes": "occluded;flying", "results": tmp_path / "kept.jsonl"}
+    first = main(tmp_path, **settings)
+    assert len(asked) == 1 + 4 + 3  # as it ships once
+    again = main(tmp_path, **settings, only_chart=True)
+    assert again == first and len(asked) == 8
+    value = {(r.method, r.condition, r.metric): r.value for r in first}
+    assert value["occluded, share", "0.6", "hidden_nll_above_shipped"] == pytest.approx(0.6)
+    assert value["occluded, share", "0.6", "flagged"] == 1.0 and value["occluded, share", "0.3", "flagged"] == 0.0
+    with pytest.raises(ValueError, match="leave --only-chart"):
+        main(tmp_path, **{**settings, "n": 2}, only_chart=True)
+
+
 @pytest.mark.slow
 def test_a_shape_that_is_none_is_flagged_and_nothing_breaks() -> None:
     prior, rate, picture = load_prior(None), base_rate(128), any_view(TEST_SEEDS[FIRST])
     whole = look(picture, AXES[0], 0.0, prior, rate, 0)
-    assert whole.values is not None and not whole.flagged
+    assert whole.hidden_nll is not None and not whole.flagged
     noise = look(picture, Axis("noise", (0.0, 1.0), noise_frame), 1.0, prior, rate, 0)
     assert noise.flagged and not noise.broken
     hidden = look(picture, Axis("occluded", (0.0, 0.8), occlusion), 0.8, prior, rate, 0)
-    assert not hidden.broken and (hidden.flagged or hidden.values["hidden_nll"] > 0.0)
+    assert not hidden.broken and (hidden.flagged or hidden.hidden_nll > 0.0)

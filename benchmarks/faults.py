@@ -1,0 +1,146 @@
+"""What can be made worse, by growing amounts: faults of sensor and calibration, and too little of the model."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from perception.controller import ControllerConfig
+from perception.source import Frame
+
+
+def intrinsics(frame: Frame, amount: float) -> Frame:
+    """Focal length too long by a share."""
+    K = frame.camera.K.copy()
+    K[[0, 1], [0, 1]] *= 1.0 + amount
+    return replace(frame, camera=replace(frame.camera, K=K))
+
+
+def depth_scale(frame: Frame, amount: float) -> Frame:
+    """All depths too long by a share."""
+    assert frame.depth is not None
+    return replace(frame, depth=frame.depth * np.float32(1.0 + amount))
+
+
+def depth_noise(frame: Frame, amount: float) -> Frame:
+    """Independent errors of this standard deviation, m, that nobody states."""
+    assert frame.depth is not None
+    noise = np.random.default_rng(1).normal(0.0, amount, frame.depth.shape)
+    return replace(frame, depth=(frame.depth + noise).astype(np.float32))
+
+
+def holes(frame: Frame, amount: float) -> Frame:
+    """No depth in patches that cover a share of the picture."""
+    assert frame.depth is not None
+    patches = ndimage.gaussian_filter(np.random.default_rng(2).normal(size=frame.depth.shape), 8.0)
+    lost = patches > np.quantile(patches, 1.0 - amount) if amount > 0 else np.zeros(patches.shape, bool)
+    return replace(frame, depth=np.where(lost, np.nan, frame.depth).astype(np.float32))
+
+
+def flying(frame: Frame, amount: float) -> Frame:
+    """Pixels so far (px) from the object's outline float between it and what is behind."""
+    assert frame.depth is not None and frame.label is not None
+    mask, width = frame.label == 1, round(amount)
+    if not width:
+        return frame
+    band = ndimage.binary_dilation(mask, iterations=width) & ~ndimage.binary_erosion(mask, iterations=width)
+    far, near = (
+        f(np.nan_to_num(frame.depth, nan=1.0), 2 * width + 3) for f in (ndimage.maximum_filter, ndimage.minimum_filter)
+    )
+    mixed = near + np.random.default_rng(3).random(mask.shape) * (far - near)
+    return replace(frame, depth=np.where(band, mixed, frame.depth).astype(np.float32))
+
+
+def mask_shift(frame: Frame, amount: float) -> Frame:
+    """The label map beside the object by so many px."""
+    assert frame.label is not None
+    return replace(frame, label=np.roll(frame.label, round(amount), axis=1))
+
+
+def plane_tilt(frame: Frame, amount: float) -> Frame:
+    """The table's depths turned about the picture's axis by so many degrees, the object's left as they are."""
+    assert frame.depth is not None and frame.label is not None
+    v = (np.arange(frame.depth.shape[0]) - frame.camera.K[1, 2]) / frame.camera.K[1, 1]
+    slope = 1.0 + np.tan(np.deg2rad(amount)) * v[:, None]
+    return replace(frame, depth=np.where(frame.label == 1, frame.depth, frame.depth * slope).astype(np.float32))
+
+
+def occlusion(frame: Frame, amount: float) -> Frame:
+    """Something near hides the left share of the object's pixels."""
+    assert frame.depth is not None and frame.label is not None
+    columns = np.flatnonzero((frame.label == 1).any(axis=0))
+    before = np.cumsum((frame.label == 1).sum(axis=0)) <= amount * np.count_nonzero(frame.label == 1)
+    band = np.zeros(frame.label.shape, bool)
+    band[:, max(columns[0] - 20, 0) : columns[0] + int(before[columns[0] :].sum())] = amount > 0
+    near = 0.7 * np.nanmin(frame.depth[frame.label == 1])
+    rgb = np.where(band[..., None], np.uint8(90), frame.rgb)
+    return replace(
+        frame,
+        rgb=rgb,
+        depth=np.where(band, near, frame.depth).astype(np.float32),
+        label=np.where(band, 2, frame.label).astype(np.int32),
+    )
+
+
+def noise_frame(frame: Frame, amount: float) -> Frame:
+    """So large a share of the object's depths, drawn anew from all over its box: no shape at all at 1."""
+    assert frame.depth is not None and frame.label is not None
+    rng, mask = np.random.default_rng(4), frame.label == 1
+    low, high = np.nanquantile(frame.depth[mask], (0.01, 0.99))
+    drawn = rng.uniform(low, high + 0.05, mask.shape)
+    lost = mask & (rng.random(mask.shape) < amount)
+    rgb = np.where(lost[..., None], rng.integers(0, 256, frame.rgb.shape), frame.rgb).astype(np.uint8)
+    return replace(frame, rgb=rgb, depth=np.where(lost, drawn, frame.depth).astype(np.float32))
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One thing that is made worse: by a fault of the frame, or by another configuration."""
+
+    name: str
+    amounts: tuple[float, ...]  # the first is how it ships
+    fault: Callable[[Frame, float], Frame] | None = None
+    configured: Callable[[ControllerConfig, float], ControllerConfig] | None = field(default=None, compare=False)
+    harms: bool = True  # the last amount is expected to be worse than the first, or flagged
+
+
+def _infer(name: str) -> Callable[[ControllerConfig, float], ControllerConfig]:
+    def configured(config: ControllerConfig, amount: float) -> ControllerConfig:
+        value: Any = type(getattr(config.infer, name))(getattr(config.infer, name) * amount)
+        return replace(config, infer=replace(config.infer, **{name: value}))
+
+    return configured
+
+
+def _particles(config: ControllerConfig, amount: float) -> ControllerConfig:
+    smc = config.infer.smc
+    smc = replace(
+        smc, particles=max(2, int(smc.particles * amount)), start_particles=max(2, int(smc.start_particles * amount))
+    )
+    return replace(config, infer=replace(config.infer, smc=smc))
+
+
+def _rays(config: ControllerConfig, amount: float) -> ControllerConfig:
+    o = config.observe
+    colour, free, occluder = (max(1, int(n * amount)) for n in (o.colour_rays, o.free_rays, o.occluder_rays))
+    return replace(config, observe=replace(o, colour_rays=colour, free_rays=free, occluder_rays=occluder))
+
+
+AXES = (
+    Axis("focal length, share", (0.0, 0.02, 0.05, 0.1, 0.2), intrinsics),
+    Axis("depth scale, share", (0.0, 0.02, 0.05, 0.1, 0.2), depth_scale),
+    Axis("depth noise, m", (0.0, 0.003, 0.01, 0.03), depth_noise),
+    Axis("depth holes, share", (0.0, 0.3, 0.6, 0.9), holes, harms=False),
+    Axis("flying pixels, px", (0.0, 2.0, 4.0, 8.0), flying),
+    Axis("mask beside, px", (0.0, 3.0, 10.0, 30.0), mask_shift),
+    Axis("plane tilted, degrees", (0.0, 1.0, 3.0, 10.0), plane_tilt),
+    Axis("occluded, share", (0.0, 0.3, 0.6, 0.8, 0.95), occlusion),
+    Axis("noise instead of shape, share", (0.0, 0.1, 0.3, 1.0), noise_frame),
+    Axis("wall_sigma, times", (1.0, 0.3, 0.1), configured=_infer("wall_sigma")),
+    Axis("wall_sigma too large, times", (1.0, 3.0, 10.0), configured=_infer("wall_sigma")),
+    Axis("lattice, times", (1.0, 0.5, 0.25), configured=_infer("lattice")),
+    Axis("pixels, times", (1.0, 0.5, 0.25, 0.125), configured=_rays),
+    Axis("particles, times", (1.0, 0.33, 0.1, 0.05), configured=_particles),
+)
