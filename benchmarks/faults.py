@@ -60,11 +60,22 @@ def mask_shift(frame: Frame, amount: float) -> Frame:
 
 
 def plane_tilt(frame: Frame, amount: float) -> Frame:
-    """The table's depths turned about the picture's axis by so many degrees, the object's left as they are."""
-    assert frame.depth is not None and frame.label is not None
-    v = (np.arange(frame.depth.shape[0]) - frame.camera.K[1, 2]) / frame.camera.K[1, 1]
-    slope = 1.0 + np.tan(np.deg2rad(amount)) * v[:, None]
-    return replace(frame, depth=np.where(frame.label == 1, frame.depth, frame.depth * slope).astype(np.float32))
+    """The table turned under the object by so many degrees, about a level line across the picture, in depth alone."""
+    assert frame.depth is not None and frame.label is not None and frame.T_world_camera is not None
+    height, width = frame.depth.shape
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    rays = frame.camera.rays(np.column_stack([u.ravel(), v.ravel()]).astype(float)).reshape(height, width, 3)
+    R, at = frame.T_world_camera[:3, :3], frame.T_world_camera[:3, 3]
+    normal = R.T @ [0.0, 0.0, 1.0]  # of the table, on which the world's z is 0, in the camera frame
+    middle = np.argwhere(frame.label == 1).mean(axis=0).astype(int)
+    below = rays[tuple(middle)]
+    foot = below * (-at[2] / (below @ normal))  # where the ray through the object's middle meets the table
+    c, s = np.cos(np.deg2rad(amount)), np.sin(np.deg2rad(amount))
+    turned = np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ normal
+    with np.errstate(divide="ignore"):
+        z, z_turned = rays[..., 2] * -at[2] / (rays @ normal), rays[..., 2] * (foot @ turned) / (rays @ turned)
+    table = (np.abs(frame.depth - z) < 0.02) & (frame.label != 1) & (z_turned > 0)
+    return replace(frame, depth=np.where(table, frame.depth + z_turned - z, frame.depth).astype(np.float32))
 
 
 def occlusion(frame: Frame, amount: float) -> Frame:
@@ -103,7 +114,6 @@ class Axis:
     amounts: tuple[float, ...]  # the first is how it ships
     fault: Callable[[Frame, float], Frame] | None = None
     configured: Callable[[ControllerConfig, float], ControllerConfig] | None = field(default=None, compare=False)
-    harms: bool = True  # the last amount is expected to be worse than the first, or flagged
 
 
 def _infer(name: str) -> Callable[[ControllerConfig, float], ControllerConfig]:
@@ -132,7 +142,7 @@ AXES = (
     Axis("focal length, share", (0.0, 0.02, 0.05, 0.1, 0.2), intrinsics),
     Axis("depth scale, share", (0.0, 0.02, 0.05, 0.1, 0.2), depth_scale),
     Axis("depth noise, m", (0.0, 0.003, 0.01, 0.03), depth_noise),
-    Axis("depth holes, share", (0.0, 0.3, 0.6, 0.9), holes, harms=False),
+    Axis("depth holes, share", (0.0, 0.3, 0.6, 0.9), holes),
     Axis("flying pixels, px", (0.0, 2.0, 4.0, 8.0), flying),
     Axis("mask beside, px", (0.0, 3.0, 10.0, 30.0), mask_shift),
     Axis("plane tilted, degrees", (0.0, 1.0, 3.0, 10.0), plane_tilt),

@@ -19,7 +19,7 @@ from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
 from benchmarks.calibration import any_view
@@ -35,7 +35,7 @@ from perception.simulate import Scene, render, sense
 from perception.track import Tracker
 from probnerf.families.tabletop import TEST_SEEDS
 from probnerf.metrics import hidden_nll, paired_interval, scored_voxels
-from probnerf.occupancy import coarsen
+from probnerf.occupancy import coarsen, voxel_centres
 from probnerf.store import load_prior
 
 RESULTS = Path(__file__).with_suffix(".jsonl")
@@ -67,6 +67,17 @@ def second_answer(
     return found.hypotheses, found.change
 
 
+def shapes_in(view: VesselView, picture: VesselPicture, h: Hypotheses) -> Bool[np.ndarray, "S 32 32 32"]:
+    """The hypotheses on the voxels of the first view's cube, whatever cube they were given in (an object that is taken
+    for a moved one begins anew in the second picture's).
+    """
+    points = view.cube.to_camera(voxel_centres(h.grid).reshape(-1, 3))
+    points = points @ picture.T_world_camera[:3, :3].T + picture.T_world_camera[:3, 3]
+    index = h.voxels("world", *points.T)
+    shapes = h.solid.reshape(len(h.weights), -1).take(np.maximum(index, 0), axis=1) & (index >= 0)
+    return coarsen(shapes.reshape(h.solid.shape), GRID)
+
+
 def main(
     out: Path,
     quick: bool = False,
@@ -88,7 +99,8 @@ def main(
     if quick:
         n, results = min(n, 2), out / "next_view.jsonl" if results == RESULTS else results
     loaded, config = load_prior(prior), ControllerConfig()
-    digest = sha256(json.dumps(asdict(config), sort_keys=True, default=str).encode()).hexdigest()[:12]
+    told = json.dumps(asdict(config), sort_keys=True, default=str)
+    digest = sha256(told.encode()).hexdigest()[:12] + "-quick" * quick
     common = {"prior": loaded.hash, "settings": {"digest": digest}, "seed": seed, "condition": "any view"}
     if not only_chart:
         done = {key(line) for line in read_lines(results)}
@@ -100,11 +112,12 @@ def main(
             if all(key({**common, "method": who, "object": number}) in done for who in CHOICES):
                 found += 1
                 continue
+            picture = any_view(number)
             try:
-                picture = any_view(number)
                 view = vessel_view(picture)
                 answered = _measured(Tracker(loaded, config, seed=seed), picture, view, rate, seed)
-            except ValueError:  # outside perception's range of sizes, too few pixels, or out of the second picture
+            except ValueError as refusal:  # outside perception's range of sizes, or too few pixels in either picture
+                say(f"object {number} is left out: {refusal}")
                 continue
             found += 1
             for who, line in answered.items():
@@ -124,7 +137,7 @@ def _measured(
     scored = scored_voxels(view.seen, rate)
 
     def judged(h: Hypotheses) -> float:
-        p = np.tensordot(h.weights, coarsen(h.solid, GRID), 1)
+        p = np.tensordot(h.weights, shapes_in(view, picture, h), 1)
         return round(hidden_nll(p, rate, view.solid, scored), 5)
 
     first = tracker.update(view.frame, view.segment, stages=STAGES).hypotheses

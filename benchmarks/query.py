@@ -4,7 +4,7 @@ Objects of the test seeds from one random view each, as `farside bench calibrati
 unseen space (2 to 10 voxels a side about a voxel that may be occupied; what was seen in them does not count) it is
 asked whether all of it is free. Three ways to answer from the same hypotheses:
 
-- joint: the share of hypotheses in which it is
+- joint: the share of hypotheses in which it is (without the caution that a query adds where an object is out of model)
 - independent voxels: the product of (1 - p_occupied) over its voxels
 - each voxel alone: free where p_occupied is below 0.5 in every voxel, as a map that keeps one number a voxel is read
 

@@ -45,7 +45,10 @@ def append_line(path: Path, line: Line) -> None:
 
 
 def newest(lines: Iterable[Line], prior: str, seed: int) -> list[Line]:
-    """Lines of one prior and seed, and of each method those whose settings are the last ones in the file."""
-    chosen = [line for line in lines if line["prior"] == prior and line["seed"] == seed]
+    """Lines of one prior and seed, and of each method those whose settings are the last ones in the file.
+
+    Of a result that a cut made twice, the last one.
+    """
+    chosen = list({key(line): line for line in lines if line["prior"] == prior and line["seed"] == seed}.values())
     settings = {line["method"]: line["settings"] for line in chosen}
     return [line for line in chosen if line["settings"] == settings[line["method"]]]

@@ -9,6 +9,9 @@ and no shape that the prior does not know: what is wrong here is the sampler's, 
 - volume: of the whole shape; hidden: of its half away from the camera; voxel: whether one random far voxel is solid
 - yaw (where the pose is unknown); log_likelihood of the pixels
 
+The quick sampler is what ships, but that all of its particles start from the prior, as no picture is drawn that the
+encoder could read, and that there is one run.
+
 outside: how far the ranks' distribution function leaves the band that 95% of uniform samples stay in as a whole
 (`metrics.uniform_band`), 0 where it stays inside. coverage90: share of truths in the central 90%.
 
@@ -66,14 +69,15 @@ def _prior() -> Model:
 
 
 THOROUGH = TemperedSMCConfig(populations=2, particles=96, start_particles=768, moves=4, final_stages=2, keep=2)
-SHIPPED = replace(InferConfig().smc, evidence_power=1.0)
+QUICK = replace(InferConfig().smc, evidence_power=1.0)  # what ships, but for its starts, runs and weights
 CONDITIONS = (
     Condition("cylinder", CylinderModel, TemperedSMCConfig(), columns=6, rows=5, lattice=12),
     Condition("shipped prior, pose known", _prior, THOROUGH, pose=False),
     Condition("shipped prior", _prior, THOROUGH),
     Condition("shipped prior, delta", _prior, THOROUGH, delta=True),
-    Condition("shipped prior, default sampler", _prior, SHIPPED),
-    Condition("shipped prior, default sampler, root of the evidence", _prior, replace(SHIPPED, evidence_power=0.5)),
+    Condition("cylinder, quick sampler", CylinderModel, QUICK, columns=6, rows=5, lattice=12),
+    Condition("shipped prior, quick sampler", _prior, QUICK),
+    Condition("shipped prior, quick sampler, root of the evidence", _prior, replace(QUICK, evidence_power=0.5)),
 )
 
 
@@ -158,7 +162,7 @@ def main(
         n, results = min(n, 20), out / "sbc.jsonl" if results == RESULTS else results
     wanted = [c.strip() for c in (conditions or ("cylinder" if quick else "")).split(";") if c.strip()]
     chosen = [c for c in CONDITIONS if not wanted or c.name in wanted]
-    if not chosen:
+    if len(chosen) < len(wanted):
         raise ValueError(f"no condition {conditions!r}; there are: {'; '.join(c.name for c in CONDITIONS)}")
     done = {key(line): line["ranks"] for line in read_lines(results)}
     prior = load_prior(None).hash

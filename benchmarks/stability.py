@@ -2,9 +2,10 @@
 
 The same views throughout: objects of the test seeds as they come, from a random camera (`farside bench calibration`).
 Sensor and calibration are spoilt by growing amounts, or the model is given too little, and everything else is left as
-it ships. At every amount, over the views: hidden_nll of what is truly unseen; flagged: share of answers that say
-`out_of_model`, or that perception refuses in words; falsely_free: of random unseen boxes given p_free > 0.95, the share
-that is occupied. An exception other than a refusal, or a number that is none, counts as broken: there must be none.
+it ships. At every amount: hidden_nll of what is truly unseen, over the views that were answered; flagged: share of
+answers that say `out_of_model`, or that perception refuses in words; falsely_free: of random unseen boxes given
+p_free > 0.95, the share that is occupied. An exception other than a refusal, or a number that is none, counts as
+broken: there must be none.
 
 Answers are appended to a file as they come, and what is there is not made again.
 """
@@ -44,6 +45,7 @@ class Seen:
 
     hidden_nll: float | None  # None: perception refused, or broke
     flagged: bool
+    refused: str = ""  # why, in perception's words
     broken: str = ""  # the exception, or which number was none
     p_free: tuple[float, ...] = ()  # of each box
     occupied: tuple[bool, ...] = ()  # truly
@@ -60,10 +62,10 @@ def look(
     try:
         view = vessel_view(picture, fault=None if fault is None else lambda frame: fault(frame, amount))
         found = estimate(view.frame, view.segment, prior, config, seed=seed, stages=240)
-    except ValueError:  # a refusal, in words
-        return Seen(None, True)
-    except Exception as error:  # what must not be
-        return Seen(None, False, f"{type(error).__name__}: {error}")
+    except Exception as error:
+        if type(error) is ValueError:  # in words, which the file keeps; NumPy's own are of a class of their own, mostly
+            return Seen(None, True, refused=str(error))
+        return Seen(None, False, broken=f"{type(error).__name__}: {error}")  # what must not be
     h = found.hypotheses
     rng = np.random.default_rng([seed, view.seed, 31])
     scored = scored_voxels(view.seen, rate)
@@ -79,8 +81,8 @@ def look(
     judged = score(view, answer, rate, random_boxes(scored, BOXES, rng), rng)
     nll = judged.values["hidden_nll"]
     if not (np.isfinite(p).all() and np.isfinite(nll)):
-        return Seen(None, h.out_of_model, "not finite")
-    return Seen(nll, h.out_of_model, "", tuple(judged.p_free.tolist()), tuple(judged.occupied.tolist()))
+        return Seen(None, h.out_of_model, broken="not finite")
+    return Seen(nll, h.out_of_model, p_free=tuple(judged.p_free.tolist()), occupied=tuple(judged.occupied.tolist()))
 
 
 def main(
@@ -110,7 +112,8 @@ def main(
     if not chosen:
         raise ValueError(f"no axis begins with {axes!r}; there are: {'; '.join(a.name for a in AXES)}")
     loaded, rate = load_prior(prior), base_rate(128 if quick else 1024)
-    digest = sha256(json.dumps(asdict(ControllerConfig()), sort_keys=True, default=str).encode()).hexdigest()[:12]
+    told = json.dumps(asdict(ControllerConfig()), sort_keys=True, default=str)
+    digest = sha256(told.encode()).hexdigest()[:12] + "-quick" * quick
     same = {"prior": loaded.hash, "method": "tempered_smc", "settings": {"digest": digest}, "seed": seed}
     done = {key(line): line for line in read_lines(results)}
 
@@ -191,7 +194,8 @@ def _rows(axes: Sequence[Axis], found: dict[str, list[list[Seen]]]) -> list[Row]
             }
             units = {"hidden_nll": "nats", "hidden_nll_above_shipped": "nats"}
             rows += [
-                Row("stability", axis.name, f"{amount:g}", k, v, units.get(k, ""), len(seen)) for k, v in values.items()
+                Row("stability", axis.name, f"{amount:g}", k, v, units.get(k, ""), gap.n if k in units else len(seen))
+                for k, v in values.items()
             ]
             lines.append([axis.name, f"{amount:g}", *(f"{v:.3f}" for v in values.values())])
     table("One thing made worse", ("axis", "amount", "hidden_nll", "above", "flagged", "falsely_free", "broken"), lines)

@@ -4,9 +4,10 @@
     python examples/reach.py --goal -0.06 0.02 -0.03      # in another
 
 The gripper is a level box that comes in straight, from one of 24 directions, after it went around the object at a
-distance. Of each direction the node says, jointly over its hypotheses, how likely the swept box is free
-(`~/query_region`); the shortest way that is free enough is taken, or none. How often that collides, and what it costs
-beside other rules, is measured by `farside bench reach`.
+distance. Of each direction the node says, jointly over its hypotheses, how likely the swept box is free of this one
+object (`~/query_region`); the shortest way that is free enough is taken, or none. How often that collides, and what it
+costs beside other rules, is measured by `farside bench reach`. What is outside the object's cube counts as free here:
+other objects, and whatever else stands there, are for the robot's own map to keep clear of.
 """
 
 from collections.abc import Callable, Sequence
@@ -98,7 +99,8 @@ def main(
             if not said.success:
                 raise SystemExit(said.message)
             print(
-                f"from {np.rad2deg(way.azimuth):3.0f} degrees, {100 * way.length:3.0f} cm: free with {said.p_free:.2f}"
+                f"from {np.rad2deg(way.azimuth):3.0f} degrees, {100 * way.length:3.0f} cm: free with {said.p_free:.2f},"
+                f" {100 * said.outside_fraction:.0f}% of it outside the object's cube"
             )
             return said.p_free
 
@@ -107,4 +109,7 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    try:
+        tyro.cli(main)
+    except (ValueError, OSError) as error:  # a goal out of reach; a node that is not there (TimeoutError)
+        raise SystemExit(f"reach: error: {error}") from None

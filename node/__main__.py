@@ -94,7 +94,8 @@ def _query(args: Sequence[str]) -> int:
     if (options.box is None) == (options.points is None):
         raise ValueError("a query needs either --box X0 Y0 Z0 X1 Y1 Z1 or --points FILE.xyz")
     from node.answer import answer
-    from perception.query import Box, read_points
+    from perception.query import Box
+    from perception.xyz import read_points
 
     box, points = options.box, options.points
     region = Box(box[:3], box[3:]) if box is not None else read_points(points)  # type: ignore[arg-type]

@@ -22,9 +22,8 @@ def answer(path: Path, region: Box | Points, frame: FrameName, risk: float, as_j
     result = query(load_scene(path), region, frame)
     said = verdict(result, risk)
     if as_json:
-        out.print(
-            json.dumps({"verdict": said, **result.as_dict()}, indent=1), highlight=False, soft_wrap=True, markup=False
-        )
+        told = {"verdict": said, "risk": risk, **result.as_dict()}
+        out.print(json.dumps(told, indent=1), highlight=False, soft_wrap=True, markup=False)
         return
     table = Table.grid(padding=(0, 2))
     for name, value in ((f"verdict at a risk of {risk:g}", said), *rows(result)):
@@ -41,7 +40,10 @@ def rows(r: QueryResult) -> list[tuple[str, str]]:
         ("all of it is free", f"{r.p_free:.3f} ± {r.p_free_se:.3f}"),
         ("occupied volume", f"{v['q50']:.1f} cm³ (5 to 95%: {v['q05']:.1f} to {v['q95']:.1f})"),
         ("unseen", f"{100 * r.unseen_fraction:.0f}%"),
-        ("outside every object's cube", f"{100 * r.outside_fraction:.0f}% (counted as free: it was not looked at)"),
+        (
+            "outside every object's cube",
+            f"{100 * r.outside_fraction:.0f}% (or in the table: nobody looked)",
+        ),
         ("mean entropy", f"{r.entropy_nats:.3f} nats per voxel"),
         ("effective hypotheses", f"{r.effective_hypotheses:.1f}"),
     ]

@@ -8,7 +8,6 @@ of each, and the probability that a region is free of all is the product over *o
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -98,11 +97,12 @@ class QueryResult:
 
     p_free: float  # probability that no occupied voxel lies in the region
     p_free_se: float  # its Monte Carlo standard error
+    p_free_few: float  # p_free by the rule of succession: what so few hypotheses can tell of it
     volume_m3: dict[
         str, float
     ]  # occupied volume in the region: quantiles q05, q50, q95 (points: of the voxels they hit)
     unseen_fraction: float  # share of the region inside some object's cube that no pixel has seen
-    outside_fraction: float  # share of the region outside every object's cube: unobserved, not free
+    outside_fraction: float  # share of the region outside every object's cube, or in the table: unobserved
     entropy_nats: float  # mean over the region's voxels of the binary entropy of p_occupied; 0 where it has no voxels
     effective_hypotheses: float  # distinct weighted hypotheses behind the answer; of several objects, the fewest
     age_s: float  # since the (oldest) frame's stamp
@@ -121,7 +121,7 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
     """
     _check_scene(scene, frame)
     touched = []  # objects that have voxels in the region
-    p_free, p_free_se, volumes, entropies = [], [], [], []
+    p_free, p_free_se, p_free_few, volumes, entropies = [], [], [], [], []
     for h in scene:
         index, volume = _region_voxels(h, region, frame)
         if not len(index):
@@ -136,6 +136,8 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
         touched.append(h)
         p_free.append(float(free))
         p_free_se.append(float(se))
+        n = h.effective_hypotheses
+        p_free_few.append((n * float(free) + 1.0) / (n + 2.0))
         volumes.append((filled, weights))
         entropies.append(binary_entropy(marginal(h)[index]))
     # Errors of a product of independent factors: sum over objects of (se_o times the other factors)^2.
@@ -144,6 +146,7 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
     return QueryResult(
         p_free=float(np.prod(p_free)),
         p_free_se=float(np.linalg.norm(np.multiply(p_free_se, others))),
+        p_free_few=float(np.prod(p_free_few)),
         volume_m3=_volume_quantiles(volumes),
         unseen_fraction=unseen,
         outside_fraction=outside,
@@ -152,35 +155,6 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
         age_s=((time.time_ns() if now_ns is None else now_ns) - min(h.stamp_ns for h in scene)) * 1e-9,
         p_occupied=_p_occupied(scene, region, frame) if isinstance(region, Points) else None,
     )
-
-
-def read_points(path: str | Path) -> Points:
-    """Read an .xyz file: one point a line, x y z in metres; further columns and # comments are left out.
-
-    Raises FileNotFoundError, or ValueError naming the line.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; give a text file with x y z (metres) on each line")
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not a text file; write x y z (metres) on each line") from error
-    rows = []
-    for number, line in enumerate(lines, 1):
-        words = line.partition("#")[0].split()
-        if not words:
-            continue
-        try:
-            x, y, z = map(float, words[:3])
-        except ValueError as error:
-            raise ValueError(f"{path}, line {number}: '{line[:60]}' is not a point; write x y z (metres)") from error
-        if not np.isfinite(x + y + z):
-            raise ValueError(f"{path}, line {number}: '{line[:60]}' is not finite; leave the line out")
-        rows.append((x, y, z))
-    if not rows:
-        raise ValueError(f"{path} holds no points; write x y z (metres) on each line")
-    return Points(np.array(rows))
 
 
 def _check_scene(scene: Sequence[Hypotheses], frame: FrameName) -> None:
@@ -274,7 +248,10 @@ def _lattice(
 
 
 def _fractions(scene: Sequence[Hypotheses], region: Region, frame: FrameName) -> tuple[float, float]:
-    """Shares of the region that are (inside some cube but not seen, outside every cube)."""
+    """Shares of the region that are (inside some cube but not seen, outside every cube or inside the table).
+
+    The table's height may err by a voxel.
+    """
     share = np.ones(())
     if isinstance(region, Points):
         x, y, z = region.points.T
@@ -289,8 +266,9 @@ def _fractions(scene: Sequence[Hypotheses], region: Region, frame: FrameName) ->
     inside = seen = np.zeros((), bool)
     for h in scene:
         index = h.voxels(frame, x, y, z)
-        inside = inside | (index >= 0)
-        seen = seen | ((index >= 0) & h.seen.ravel()[index])
+        above = (index >= 0) & ((index % h.grid + 1.5) * 2.0 / h.grid - 1.0 >= BASE_Z)
+        inside = inside | above
+        seen = seen | (above & h.seen.ravel()[index])
     share = np.broadcast_to(share, np.shape(inside))
     return float(np.average(inside & ~seen, weights=share)), float(np.average(~inside, weights=share))
 

@@ -28,7 +28,7 @@ def test_the_law_holds(law: Callable, module: ModuleType) -> None:
 def smc_with(edited: ModuleType) -> ModuleType:
     """Tempered SMC that draws its names from an edited module."""
     made = laws.mutant("probnerf.smc")
-    for name in ("hmc_step", "Target", "choose", "next_beta"):
+    for name in ("choose", "next_beta"):
         if hasattr(edited, name):
             setattr(made, name, getattr(edited, name))
     return made
@@ -59,7 +59,7 @@ MUTATIONS = {
         laws.hmc_leaves_its_target_alone,
         hmc_edited(("accepted = uniform[1] < acceptance", "accepted = ~divergent")),
     ),
-    "the momentum of the iteration before": (
+    "a momentum that is the position's": (
         laws.hmc_leaves_its_target_alone,
         hmc_edited(("jax.random.normal(momentum_key, state.position.shape)", "0.7 * state.position")),
     ),
