@@ -165,7 +165,8 @@ def sense(
     rightwards = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
     lost[:, :-1] |= column[:, :-1] > rightwards[:, 1:] + 1.0
     lost |= _blobs(rng, shape, config)
-    z = z + (config.noise + config.noise_z2 * z**2) * _noise(rng, shape, config.noise_width)
+    with np.errstate(invalid="ignore"):  # where there is nothing, z is infinite, and lost below
+        z = z + (config.noise + config.noise_z2 * z**2) * _noise(rng, shape, config.noise_width)
     z = np.rint(z / config.quantum) * config.quantum
     lost |= ~(z > 0) | (z > config.max_range)
     gain = 1.0 + 0.01 * rng.standard_normal()
