@@ -76,7 +76,7 @@ def hmc_leaves_its_target_alone(hmc: ModuleType) -> None:
         return jax.lax.scan(body, target.evaluate(q), jax.random.split(jax.random.key(0), 20))
 
     state, acceptance = moved(jnp.asarray(start, jnp.float32))
-    if not 0.3 < float(acceptance.mean()) < 0.95:  # or the accept test is not needed
+    if not 0.1 < float(acceptance.mean()) < 0.95:  # or the accept test is not needed
         raise RuntimeError(f"the law asks nothing of this sampler: acceptance {float(acceptance.mean()):.2f}")
     z = (np.asarray(state.position, np.float64) - mean) @ np.linalg.cholesky(np.linalg.inv(covariance))
     assert_zero(z)
