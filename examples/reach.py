@@ -90,6 +90,7 @@ def main(
     with Bus(BusConfig(name="reach", connect=(connect,))) as bus:
 
         def p_free(way: Reach) -> float:
+            """The node's probability that the way is free of the object; ends the program where it has none."""
             edges = make("geometry_msgs/msg/Vector3", **dict(zip("xyz", way.size.tolist(), strict=True)))
             box = make("farside_msgs/msg/OrientedBox", pose=pose(way.T_object_box), size=edges)
             request = make(
