@@ -10,10 +10,10 @@ _FRACTIONS = np.geomspace(1e-9, 1.0, 361).astype(np.float32)
 
 
 def ess(log_w: Float[Array, "n"]) -> Float[Array, ""]:
-    """(sum w)^2 / sum w^2; 0 if no weight is left."""
+    """(sum w)^2 / sum w^2; 0 if no weight is left. Never above n, so that no variance made of it is below 0."""
     top = jnp.max(log_w)
     w = jnp.exp(log_w - jnp.where(jnp.isfinite(top), top, 0.0))
-    return jnp.sum(w) ** 2 / jnp.maximum(jnp.sum(w * w), 1e-30)
+    return jnp.minimum(jnp.sum(w) ** 2 / jnp.maximum(jnp.sum(w * w), 1e-30), float(log_w.size))
 
 
 def next_beta(

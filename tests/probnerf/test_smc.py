@@ -11,6 +11,7 @@ import pytest
 
 from probnerf.hmc import StageInfo
 from probnerf.populations import log_prior
+from probnerf.resampling import ess as effective_size
 from probnerf.resampling import next_beta
 from probnerf.smc import TemperedSMCConfig, tempered_smc
 from probnerf.types import Posterior
@@ -286,6 +287,12 @@ def test_the_step_of_beta():
     assert 0 < float(beta) < 1e-6
     assert float(ess) == pytest.approx(56.0)
     assert np.all(np.isneginf(log_w[:200]))
+
+
+def test_no_effective_sample_size_is_above_the_number_of_particles() -> None:
+    nearly = 1e-7 * jax.random.normal(jax.random.key(0), (500, 384))  # rounding took most of these over it
+    assert float(jnp.max(jax.vmap(effective_size)(nearly))) <= 384
+    assert float(jnp.min(jax.vmap(effective_size)(nearly))) > 383.9
 
 
 def test_wrong_input_is_named():
