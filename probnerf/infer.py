@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
 from probnerf import foam, fused
-from probnerf.hmc import AnnealedHMCConfig, StageInfo, annealed_hmc
+from probnerf.annealed import AnnealedHMCConfig, annealed_hmc
+from probnerf.hmc import StageInfo
+from probnerf.mixture import GaussianMixture
 from probnerf.model import (
     POSE_SIZE,
     Likelihood,
@@ -23,11 +25,12 @@ from probnerf.model import (
     range_offset_of,
     split_position,
 )
+from probnerf.modes import ModesConfig, mixture_of_modes
 from probnerf.populations import start_from
 from probnerf.prior import ProbNeRF
-from probnerf.proposal import Picture, propose
+from probnerf.proposal import Picture, encoder_positions, even_yaws
 from probnerf.smc import TemperedSMCConfig, tempered_smc
-from probnerf.types import BASE_Z, OBJECT, UNKNOWN, Observation, Pose, Posterior
+from probnerf.types import BASE_Z, OBJECT, UNKNOWN, Diagnostics, Observation, Pose, Posterior
 
 Method = Literal["tempered_smc", "annealed_hmc"]
 _NOWHERE = 50.0  # cube units, outside every window: the kernel passes such points over
@@ -58,6 +61,7 @@ class InferConfig:
 
     method: Method = "tempered_smc"
     smc: TemperedSMCConfig = field(default_factory=quick_smc)
+    modes: ModesConfig = field(default_factory=ModesConfig)  # where tempered_smc begins
     hmc: AnnealedHMCConfig = field(default_factory=AnnealedHMCConfig)
     lattice: int = 32  # G: cubes per 2 units
     extent: float = 1.1  # the lattice covers [-extent, extent]^3: an object may be larger than its guessed cube
@@ -67,7 +71,7 @@ class InferConfig:
     outlier: float = 0.01  # share of ranges from nowhere; small, for a lid over a visible cavity is no outlier
     reach: float = 0.3  # cube units behind a measured range beyond which nothing is asked
     power: float = 1.0  # kappa: what one pixel counts for
-    encoder_starts: bool = True  # propose starts by the encoder, in a defensive mixture with the prior
+    encoder_starts: bool = True  # begin at the modes that the encoder's guesses climb to; otherwise at the prior
     sample_delta: bool = False  # also infer the weights' perturbation delta
 
     def __post_init__(self) -> None:
@@ -124,13 +128,47 @@ def without_sizes(likelihood: Likelihood) -> Likelihood:
     return replace(likelihood, lattice=replace(lattice, max_crossings=3 * lattice.planes), packed=(0, 0))
 
 
+def asks_encoder(config: InferConfig, model: Model, picture: Picture | None) -> bool:
+    """Whether there is an encoder to ask, enough for it to see, and use for what it says."""
+    # delta has too many dimensions for second derivatives
+    if picture is None or not config.encoder_starts or config.sample_delta or not isinstance(model, ProbNeRF):
+        return False
+    return float(jnp.mean(picture.unknown)) <= config.modes.unknown
+
+
+def modes_of(
+    key: Array,
+    model: Model,
+    observation: Observation,
+    config: InferConfig,
+    picture: Picture | None,
+    sample_pose: bool = True,
+) -> GaussianMixture | None:
+    """Where tempering begins: the modes that the encoder's guesses climb to (`probnerf.modes`).
+
+    None, the prior, where there is no encoder to ask or too little for it to see. Behind something that hides half of
+    the object its guesses are poor, and modes about them miss what populations from the prior find.
+    """
+    if not asks_encoder(config, model, picture):
+        return None
+    assert isinstance(model, ProbNeRF) and picture is not None
+    likelihood = likelihood_of(config, observation, sample_pose)
+    count = config.modes.starts
+    if sample_pose:
+        starts = encoder_positions(key, model, picture, even_yaws(count), 1, 0.0)
+    else:
+        starts = encoder_positions(key, model, picture, np.zeros(1, np.float32), count, 1.0)[:, : model.latent]
+    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
+    return mixture_of_modes(args, starts, config.modes)
+
+
 def infer(
     key: Array,
     model: Model,
     observation: Observation,
     config: InferConfig | None = None,
     *,
-    picture: Picture | None = None,
+    reference: GaussianMixture | None = None,
     before: Posterior | None = None,
     sample_pose: bool = True,
     on_stage: Callable[[StageInfo], bool | None] | None = None,
@@ -139,10 +177,9 @@ def infer(
 ) -> tuple[Posterior, Likelihood]:
     """Sample p(z~, pose, delta | observation).
 
-    `picture` lets the encoder propose starts (ProbNeRF models only). `before` is a posterior of the same latents (the
-    same cube and pose widths) given another observation, usually a part of this one: its samples are reweighted, then
-    moved (`start_from`). `deadline` is on time.monotonic()'s clock;
-    `stages` caps the sampler's stages (iterations of annealed HMC, whose schedule is shortened to fit).
+    `reference` is where tempering begins (`modes_of`; None: the prior); `before`, instead, a posterior of the same
+    latents that was cut short, to go on from. `deadline` is on time.monotonic()'s clock; `stages` caps the sampler's
+    stages (iterations of annealed HMC, whose schedule is shortened to fit). The start is always made.
     """
     config = config or InferConfig()
     likelihood = likelihood_of(config, observation, sample_pose)
@@ -153,24 +190,43 @@ def infer(
             config.hmc if stages is None else replace(config.hmc, iterations=stages, keep=min(config.hmc.keep, stages))
         )
         return annealed_hmc(key, log_likelihood, args, dim, hmc, on_stage=on_stage, deadline=deadline), likelihood
-    initial = None
-    if before is not None:
-        initial = start_from(before, config.smc.populations)
-    elif picture is not None and config.encoder_starts and isinstance(model, ProbNeRF) and not config.sample_delta:
-        key, start = jax.random.split(key)
-        initial = propose(
-            start,
-            model,
-            likelihood,
-            picture,
-            observation.pose_sigma,
-            config.smc.populations,
-            config.smc.start_particles,
-        )
+    initial = None if before is None else start_from(before, config.smc.populations)
     posterior = tempered_smc(
-        key, log_likelihood, args, dim, config.smc, initial=initial, on_stage=on_stage, deadline=deadline, stages=stages
-    )
+        key, log_likelihood, args, dim, config.smc, initial=initial, reference=reference if before is None else None,
+        on_stage=on_stage, deadline=deadline, stages=stages,
+    )  # fmt: skip
     return posterior, likelihood
+
+
+def encoder_guess(
+    key: Array,
+    model: ProbNeRF,
+    likelihood: Likelihood,
+    observation: Observation,
+    picture: Picture,
+    yaws: int = 24,
+    draws: int = 4,
+) -> Posterior:
+    """What the encoder alone takes the object for, in a twentieth of a second: z_kj ~ q(z | picture, yaw_k) on a grid.
+
+    The weight of yaw k is its mean likelihood, W_k = sum_j p(observation | z_kj, yaw_k) / J, shared evenly by its J
+    draws: within a yaw the encoder is taken at its word. x, y and scale are perception's guess; the pose is unknown.
+    """
+    positions = encoder_positions(key, model, picture, even_yaws(yaws), draws, 1.0)
+    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
+    values = np.asarray(jax.jit(log_likelihood)(args, positions), np.float64)
+    values = np.where(np.isfinite(values), values, -np.inf)
+    top = values.max()
+    each = np.exp(values - top).reshape(yaws, draws).mean(axis=1) if np.isfinite(top) else np.ones(yaws)
+    with np.errstate(divide="ignore"):
+        log_weights = np.log(np.repeat(each / each.sum() / draws, draws))
+    nan, zero = jnp.asarray(np.float32("nan")), jnp.asarray(np.int32(0))
+    nans, none = jnp.full(len(values), nan), jnp.asarray(np.float32(0.0))
+    ess = jnp.asarray(np.float32(1.0 / np.sum(np.exp(2.0 * log_weights))))
+    diagnostics = Diagnostics(nan, zero, nan, ess, zero, zero, none, jnp.zeros(1), jnp.full(1, nan))
+    likelihoods, population = jnp.asarray(values, jnp.float32), jnp.zeros(len(values), jnp.int32)
+    weights = jnp.asarray(log_weights, jnp.float32)
+    return Posterior(positions, weights, likelihoods, nans, population, nan, nan, diagnostics, "underway")
 
 
 @jax.jit

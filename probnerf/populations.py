@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from probnerf.hmc import split_r_hat
-from probnerf.types import Posterior
+from probnerf.hmc import HMCState, split_r_hat
+from probnerf.types import Diagnostics, Posterior
 
 
 def shares(
@@ -26,6 +26,58 @@ def shares(
         return even, mean
     share = power * np.maximum(log_evidences - mean, -1e4)  # 0 times -inf is no number
     return share - np.logaddexp.reduce(share), mean
+
+
+def gathered(
+    pools: Sequence[HMCState],
+    beta: Float[np.ndarray, "m"],
+    log_evidences: Float[np.ndarray, "m"],
+    variance: Float[np.ndarray, "m"],
+    evidence_power: float,
+    told: dict[str, Array],
+    result: str,
+) -> Posterior:
+    """The pools [m, n, ...] of a run's last stages as one posterior; `told` is what else its diagnostics say.
+
+    `variance` is that of each evidence estimate, were the particles of a population independent.
+    """
+    # NumPy: the number of pools varies, and nothing may compile for it.
+    positions = np.stack([np.asarray(pool.position) for pool in pools])  # [keep, m, n, d]
+    values = np.stack([np.asarray(pool.log_likelihood) for pool in pools])
+    over = np.stack([np.asarray(pool.over_prior) for pool in pools])
+    populations = values.shape[1]
+    reached = bool(np.all(beta == 1.0))
+    share, log_evidence = shares(log_evidences if reached else np.full(populations, np.nan), evidence_power)
+    error = float("nan")
+    if np.isfinite(log_evidence):
+        ratio = np.exp(log_evidences - log_evidence)
+        spread = np.std(ratio, ddof=1) / np.sqrt(populations) if populations > 1 else 0.0
+        within = np.sqrt(np.sum(ratio**2 * variance)) / populations
+        error = float(max(spread, within))
+    log_weights = np.broadcast_to((share - np.log(values.size / populations))[None, :, None], values.shape).ravel()
+    population = np.broadcast_to(np.arange(populations, dtype=np.int32)[None, :, None], values.shape).ravel()
+    # f of the target r^(1 - beta) (prior x likelihood)^beta = prior x exp(f), over the estimate of its integral
+    f = (1.0 - beta[:, None]) * over + np.where(beta[:, None] > 0, beta[:, None] * values, 0.0)
+    log_normal = -0.5 * np.sum(positions.astype(np.float64) ** 2 + np.log(2.0 * np.pi), axis=-1)
+    with np.errstate(invalid="ignore"):  # no likelihood anywhere
+        log_density = log_normal + f - log_evidences[:, None]
+    return Posterior(
+        positions=jnp.asarray(positions.reshape(-1, positions.shape[-1])),
+        log_weights=jnp.asarray(log_weights.astype(np.float32)),
+        log_likelihoods=jnp.asarray(values.ravel()),
+        log_density=jnp.asarray(log_density.astype(np.float32).ravel()),
+        population=jnp.asarray(population),
+        log_evidence=jnp.asarray(np.float32(log_evidence)),
+        log_evidence_se=jnp.asarray(np.float32(error)),
+        diagnostics=Diagnostics(
+            r_hat=jnp.asarray(np.float32(split_r_hat(values.swapaxes(0, 1).reshape(populations, -1)))),
+            ess=jnp.asarray(np.float32(1.0 / np.sum(np.exp(2.0 * log_weights)))),
+            beta=jnp.asarray(beta, jnp.float32),
+            log_evidences=jnp.asarray(log_evidences, jnp.float32),
+            **told,
+        ),
+        result=result,
+    )
 
 
 def pooled(posteriors: Sequence[Posterior], evidence_power: float) -> Posterior:
@@ -49,6 +101,7 @@ def pooled(posteriors: Sequence[Posterior], evidence_power: float) -> Posterior:
         positions=jnp.concatenate([p.positions for p in posteriors]),
         log_weights=jnp.asarray(log_weights, jnp.float32),
         log_likelihoods=jnp.asarray(values),
+        log_density=jnp.concatenate([p.log_density for p in posteriors]),
         population=jnp.asarray(population, jnp.int32),
         log_evidence=jnp.asarray(log_evidence, jnp.float32),
         log_evidence_se=jnp.asarray(spread, jnp.float32),
@@ -67,21 +120,18 @@ def pooled(posteriors: Sequence[Posterior], evidence_power: float) -> Posterior:
 
 
 def start_from(before: Posterior, populations: int) -> tuple[Float[Array, "m n d"], Float[Array, "m n"]]:
-    """The samples of tempered SMC as starts for another target: positions per population, and log-densities there.
+    """The samples of tempered SMC as starts of another run: positions per population, and log-densities there.
 
-    Population p's samples are draws of N(q; 0, I) L(q)^beta_p / Z_p. With its own estimate of Z_p, the evidence of the
-    new target starts where the old one's ended, and populations keep their shares. Where there were more than
-    `populations`, several stand together as one. Raises ValueError where they do not divide.
+    By each population's own estimate of its evidence, so that the estimates go on from where they were, and populations
+    keep their shares. Where there were more than `populations`, several stand together as one. Raises ValueError where
+    they do not divide.
     """
-    beta, log_z = before.diagnostics.beta, before.diagnostics.log_evidences
-    m, size = len(beta), before.positions.shape[-1]
+    m, size = len(before.diagnostics.beta), before.positions.shape[-1]
     if m % populations:
         raise ValueError(f"{m} populations of samples do not divide into {populations}")
     order = np.argsort(np.asarray(before.population), kind="stable")
-    positions = before.positions[order].reshape(m, -1, size)
-    log_likelihoods = before.log_likelihoods[order].reshape(m, -1)
-    log_q = log_prior(positions) + beta[:, None] * log_likelihoods - log_z[:, None]
-    return positions.reshape(populations, -1, size), log_q.reshape(populations, -1)
+    shape = (populations, len(order) // populations)
+    return before.positions[order].reshape(*shape, size), before.log_density[order].reshape(shape)
 
 
 def log_prior(q: Float[Array, "... d"]) -> Float[Array, "..."]:

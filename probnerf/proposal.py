@@ -1,17 +1,17 @@
-"""Where particles start: a defensive mixture of the prior and of the encoder's guess at every yaw.
+"""What the encoder takes an object for, at every yaw: where climbs start (`probnerf.modes`).
 
-The encoder needs the camera in the canonical object frame, which the unknown pose turns; so a proposal first draws the
-pose from its prior, then z~ given that pose: q(q) = share N(q; 0, I) + (1 - share) N(pose; 0, I) q(z~ | picture, pose).
+It needs the camera in the canonical object frame, which the unknown yaw turns.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from probnerf.model import POSE_SIZE, Likelihood, pose_of
+from probnerf.model import POSE_SIZE
 from probnerf.prior import ProbNeRF
-from probnerf.types import Pose, identity_pose
+from probnerf.types import Pose
 from probnerf.views import camera_features, encoder_image
 
 
@@ -25,69 +25,45 @@ class Picture(eqx.Module):
     tan_half_fov: Float[Array, ""]
 
 
-def potential_at(model: ProbNeRF, picture: Picture, pose: Pose, flatten: float) -> tuple[Array, Array]:
-    """Mean and precision of q(z | picture) if the object stood at `pose`; `flatten` < 1 widens the Gaussian."""
+def potential_at(model: ProbNeRF, picture: Picture, pose: Pose) -> tuple[Array, Array]:
+    """Mean and precision of q(z | picture) if the object stood at `pose`."""
     T = picture.T_view_camera
     position = pose.to_object(T[:3, 3])
     rotation = pose.to_object_direction(T[:3, :3].T).T
     T_object_camera = jnp.eye(4).at[:3, :3].set(rotation).at[:3, 3].set(position)
     distance = picture.distance * jnp.exp(-pose.log_scale)
     image = encoder_image(picture.rgb, distance, picture.unknown, T_object_camera, picture.tan_half_fov)
-    mean, precision = model.encoder(
-        image[None], camera_features(T_object_camera, picture.tan_half_fov)[None], jnp.ones(1)
-    )
-    return mean, precision * flatten
+    return model.encoder(image[None], camera_features(T_object_camera, picture.tan_half_fov)[None], jnp.ones(1))
 
 
-def _log_encoder(model: ProbNeRF, z_tilde: Array, mean: Array, precision: Array) -> Float[Array, ""]:
-    """log q(z~): the Gaussian on z = m(z~), times |dz/dz~|."""
-    z, log_det = model.flow.forward(z_tilde)
-    return 0.5 * jnp.sum(jnp.log(precision) - jnp.log(2 * jnp.pi) - precision * (z - mean) ** 2) + log_det
+def even_yaws(count: int) -> Float[np.ndarray, "count"]:
+    """Radians, from -pi."""
+    return (np.arange(count) * (2.0 * np.pi / count) - np.pi).astype(np.float32)
 
 
-def _log_normal(x: Array) -> Float[Array, ""]:
-    return -0.5 * jnp.sum(x * x + jnp.log(2 * jnp.pi))
+def encoder_positions(
+    key: PRNGKeyArray, model: ProbNeRF, picture: Picture, yaws: Float[np.ndarray, "y"], draws: int, spread: float
+) -> Float[Array, "y_draws d"]:
+    """Positions with z = mean + spread N(0, 1 / precision) of the encoder at the given yaws, `draws` at each.
 
-
-@eqx.filter_jit
-def propose(
-    key: PRNGKeyArray,
-    model: ProbNeRF,
-    likelihood: Likelihood,
-    picture: Picture,
-    pose_sigma: Float[Array, "5"],
-    populations: int,
-    count: int,
-    prior_share: float = 0.25,
-    flatten: float = 0.5,
-    each: int = 8,
-) -> tuple[Float[Array, "m n d"], Float[Array, "m n"]]:
-    """Positions of `populations` x `count` starts and their log-density under the mixture.
-
-    `each` starts share a pose, for the encoder is what costs: every one of them has the mixture's law.
+    All else of the pose is as perception guessed it.
     """
-    k = model.latent
-    dim = k + POSE_SIZE * likelihood.sample_pose
+    noise = jax.random.normal(key, (len(yaws), draws, model.latent))
+    return _encoder_positions(model, picture, jnp.asarray(yaws), noise, spread)
 
-    def at_pose(key: PRNGKeyArray) -> tuple[Array, Array]:
-        """`each` starts at one pose, and their log-densities."""
-        pose_key, key = jax.random.split(key)
-        place = jax.random.normal(pose_key, (dim - k,))
-        pose = pose_of(place, pose_sigma) if likelihood.sample_pose else identity_pose()
-        mean, precision = potential_at(model, picture, pose, flatten)
 
-        def one(key: PRNGKeyArray) -> tuple[Array, Array]:
-            k0, k1, k2 = jax.random.split(key, 3)
-            guess, _ = model.flow.inverse(mean + jax.random.normal(k1, (k,)) / jnp.sqrt(precision))
-            z_tilde = jnp.where(jax.random.uniform(k2) < prior_share, jax.random.normal(k0, (k,)), guess)
-            log_z = jnp.logaddexp(
-                jnp.log(prior_share) + _log_normal(z_tilde),
-                jnp.log1p(-prior_share) + _log_encoder(model, z_tilde, mean, precision),
-            )
-            return jnp.concatenate([z_tilde, place]), log_z + _log_normal(place)
+@jax.jit
+def _encoder_positions(
+    model: ProbNeRF, picture: Picture, yaws: Float[Array, "y"], noise: Float[Array, "y j k"], spread: float
+) -> Float[Array, "y_j d"]:
+    zero = jnp.zeros(())
 
-        return jax.vmap(one)(jax.random.split(key, each))
+    def at(yaw: Array, noise: Array) -> Array:
+        mean, precision = potential_at(model, picture, Pose(yaw, zero, zero, zero, zero))
+        z = mean + spread * noise / jnp.sqrt(precision)
+        return jax.vmap(lambda one: model.flow.inverse(one)[0])(z)
 
-    poses = -(-count // each)
-    q, log_q = jax.lax.map(at_pose, jax.random.split(key, populations * poses), batch_size=32)
-    return q.reshape(populations, -1, dim)[:, :count], log_q.reshape(populations, -1)[:, :count]
+    z_tilde = jax.vmap(at)(yaws, noise)
+    pose = jnp.zeros((*noise.shape[:2], POSE_SIZE))
+    pose = pose.at[..., 0].set(jnp.cos(yaws)[:, None]).at[..., 1].set(jnp.sin(yaws)[:, None])
+    return jnp.concatenate([z_tilde, pose], axis=-1).reshape(-1, noise.shape[-1] + POSE_SIZE)

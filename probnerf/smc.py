@@ -1,10 +1,11 @@
 """Tempered sequential Monte Carlo: weighted samples and an evidence estimate for standard-normal latents.
 
-Independent populations of particles go from the prior (beta = 0) to the posterior (beta = 1). A *stage* makes `moves`
-HMC iterations of every particle at the present beta; the states after each of them form the population's *pool* (no
-move is wasted: waste-free SMC, Dau and Chopin 2022). Then beta takes the longest step that keeps the effective sample
-size of the pool under the weights L^(step) (conditional ESS, Zhou, Johansen and Aston 2016), and systematic resampling
-draws the next particles from it. The product of the mean weights estimates the evidence.
+Independent populations of particles go from a reference r (beta = 0; the prior, unless another is given) to the
+posterior (beta = 1), along r^(1 - beta) (prior x L)^beta. A *stage* makes `moves` HMC iterations of every particle at
+the present beta; the states after each of them form the population's *pool* (no move is wasted: waste-free SMC, Dau and
+Chopin 2022). Then beta takes the longest step that keeps the effective sample size of the pool under the weights
+(prior x L / r)^(step) (conditional ESS, Zhou, Johansen and Aston 2016), and systematic resampling draws the next
+particles from it. The product of the mean weights estimates the evidence.
 
 What tunes moves is never read off the states about to move. A population's metric is its neighbour's; the step size of
 every other particle comes from how often the rest of its own population was accepted (a neighbour may be in a mode of
@@ -25,10 +26,19 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from probnerf.hmc import HMCState, LogLikelihood, Metric, StageInfo, Target, gradient_metric, hmc_step, split_r_hat
-from probnerf.populations import log_prior, shares
+from probnerf.hmc import (
+    HMCState,
+    LogLikelihood,
+    Metric,
+    Reference,
+    StageInfo,
+    Target,
+    gradient_metric,
+    hmc_step,
+)
+from probnerf.populations import gathered, log_prior
 from probnerf.resampling import choose, next_beta
-from probnerf.types import Diagnostics, Posterior
+from probnerf.types import Posterior
 
 
 @dataclass(frozen=True)
@@ -37,7 +47,7 @@ class TemperedSMCConfig:
 
     populations: int = 2  # independent runs: their spread is the Monte Carlo error
     particles: int = 64  # per population; populations * particles positions are evaluated at a time
-    start_particles: int = 256  # drawn from the prior per population for the first importance step
+    start_particles: int = 256  # drawn from the reference per population for the first importance step
     ess_target: float = 0.5  # effective sample size kept by each step of beta, as a fraction of the pool
     moves: int = 4  # HMC iterations a stage: a population's pool has moves * particles states
     leapfrog_steps: int = 4
@@ -89,25 +99,27 @@ class _Info(eqx.Module):
     divergences: Int[Array, ""]
 
 
-def _metrics(gradient, log_w, beta, config: TemperedSMCConfig) -> Metric:
+def _metrics(force, log_w, config: TemperedSMCConfig) -> Metric:
     """Each population's metric, from the weighted pool of the population before it."""
-    rank = min(config.moves * config.particles, gradient.shape[-1])
-    gradient, log_w = jnp.roll(gradient, 1, axis=0), jnp.roll(log_w, 1, axis=0)
-    metric = jax.vmap(lambda g, w, b: gradient_metric(g, w, b, rank))(gradient, log_w, beta)
+    rank = min(config.moves * config.particles, force.shape[-1])
+    force, log_w = jnp.roll(force, 1, axis=0), jnp.roll(log_w, 1, axis=0)
+    metric = jax.vmap(lambda g, w: gradient_metric(g, w, rank))(force, log_w)
     return metric if config.metric else Metric(metric.basis, jnp.ones_like(metric.frequency))
 
 
 @partial(jax.jit, static_argnames=("log_likelihood", "config"))
-def _start(key, args, q0, log_w0, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig):
-    """Importance step from q0 [m, p0, d] with weights exp(log_w0) = prior / proposal to the first beta > 0."""
+def _start(key, args, q0, log_w0, reference, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig):
+    """Importance step from q0 [m, p0, d], whose weights for the reference are exp(log_w0), to the first beta > 0."""
     populations, count, dim = q0.shape
     chunks = -(-count // config.particles)
     padded = jnp.pad(q0, ((0, 0), (0, chunks * config.particles - count), (0, 0)))
     padded = padded.reshape(populations, chunks, config.particles, dim).swapaxes(0, 1)
-    target = Target(log_likelihood, args, jnp.zeros(()))
+    target = Target(log_likelihood, args, jnp.zeros(()), None, reference)
     # Chunks as wide as every later evaluation, so that a large start takes no more memory; gradients of the chosen only
     value = jax.lax.map(target.value, padded).swapaxes(0, 1).reshape(populations, -1)[:, :count]
     value = jnp.where(jnp.isfinite(log_w0), value, -jnp.inf)
+    if reference is not None:  # the next step's weights are of likelihood x prior over it
+        value = value - reference.over_prior(q0.reshape(-1, dim)).reshape(value.shape)
     enough = config.ess_target * config.particles  # a number, so that a larger start buys a longer first step
     beta, log_w, ess = jax.vmap(lambda w, v: next_beta(jnp.zeros(()), w, v, enough))(log_w0, value)
     ancestor = jnp.broadcast_to(jnp.arange(count), log_w.shape)
@@ -122,16 +134,16 @@ def _start(key, args, q0, log_w0, *, log_likelihood: LogLikelihood, config: Temp
         step_size=jnp.full(
             (populations, 2), config.longest_step, jnp.float32
         ),  # weakly typed, it compiles _stage twice
-        metric=_metrics(chain.gradient, jnp.zeros(ancestor.shape), beta, config),
+        metric=_metrics(chain.force(beta[:, None]), jnp.zeros(ancestor.shape), config),
         moved=jnp.zeros(populations),
     )
     return state, _Info(ess, jnp.full(populations, jnp.nan), state.step_size[:, 0], jnp.zeros((), jnp.int32))
 
 
 @partial(jax.jit, static_argnames=("log_likelihood", "config"))
-def _stage(key, state: _State, args, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig):
+def _stage(key, state: _State, args, reference, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig):
     """`moves` iterations at the present beta, then the step to the next beta and resampling (at beta = 1: neither)."""
-    target = Target(log_likelihood, args, state.beta[:, None], state.metric)
+    target = Target(log_likelihood, args, state.beta[:, None], state.metric, reference)
     half = jnp.arange(config.particles) % 2
 
     def move(carry, key):
@@ -149,7 +161,7 @@ def _stage(key, state: _State, args, *, log_likelihood: LogLikelihood, config: T
     pool = jax.tree.map(lambda a: a.swapaxes(0, 1).reshape(config.populations, -1, *a.shape[3:]), pool)
     size = config.moves * config.particles
     beta, log_w, ess = jax.vmap(lambda b, v: next_beta(b, jnp.zeros(size), v, config.ess_target * size))(
-        state.beta, pool.log_likelihood
+        state.beta, pool.log_ratio
     )
     # copies that have not moved agree with each other: their weights would let beta run ahead of them
     moved = state.moved + jnp.sum(acceptance, axis=0)
@@ -167,7 +179,7 @@ def _stage(key, state: _State, args, *, log_likelihood: LogLikelihood, config: T
     )
     variance = jnp.where(tempering, state.variance + 1.0 / ess - 1.0 / size, state.variance)
     beta = jnp.where(tempering, beta, 1.0)
-    metric = _metrics(pool.gradient, log_w, beta, config)
+    metric = _metrics(pool.force(beta[:, None]), log_w, config)
     moved = jnp.where(held, moved, 0.0)
     state = _State(chain, beta, log_evidence, variance, ancestor, step, metric, moved)
     info = _Info(jnp.where(tempering, ess, jnp.nan), jnp.mean(acceptance, axis=0), steps[-1], jnp.sum(divergences))
@@ -177,6 +189,11 @@ def _stage(key, state: _State, args, *, log_likelihood: LogLikelihood, config: T
 @partial(jax.jit, static_argnames=("shape",))
 def _prior_start(key, *, shape: tuple[int, int, int]):
     return jax.random.normal(key, shape), jnp.zeros(shape[:2])
+
+
+@partial(jax.jit, static_argnames=("shape",))
+def _reference_start(key, reference, *, shape: tuple[int, int, int]):
+    return reference.draw(key, shape[0] * shape[1]).reshape(shape), jnp.zeros(shape[:2])
 
 
 @jax.jit
@@ -192,17 +209,21 @@ def tempered_smc(
     config: TemperedSMCConfig | None = None,
     *,
     initial: tuple[Float[Array, "m p0 d"], Float[Array, "m p0"]] | None = None,
+    reference: Reference | None = None,
     on_stage: Callable[[StageInfo], bool | None] | None = None,
     deadline: float | None = None,
     stages: int | None = None,
 ) -> Posterior:
     """Samples N(q; 0, I) L(q) by adaptive tempered SMC, with an estimate of its integral, the evidence.
 
-    `initial` are positions drawn from any density that covers the prior (say a defensive mixture of prior and encoder)
-    and the logarithm of that density there; None draws `start_particles` from the prior. `deadline` is on the clock of
-    time.monotonic(): no stage is begun that would pass it even if as short as the shortest so far (but for the first,
-    which may compile). `stages` caps their number. Without a deadline the answer depends on key and stages alone. The
-    start is always made.
+    `reference` is a density to begin at; it must cover the posterior, and owe nothing to `key`. Where modes are narrow,
+    one that knows them keeps them (`probnerf.modes`). None: the prior. `initial` are instead positions drawn from
+    any density that covers what lies between the prior and the posterior from some beta on, say a run's that was cut
+    short, and the logarithm of that density there: they are reweighted to that beta.
+
+    `deadline` is on the clock of time.monotonic(): no stage is begun that would pass it even if as short as the
+    shortest so far (but for the first, which may compile). `stages` caps their number. Without a deadline the answer
+    depends on key and stages alone. The start is always made.
 
     The samples are the pools of the last `keep` stages. A population's share of the weight is its evidence estimate, so
     that weighted averages stay consistent when populations found different modes; with few particles, whose estimates
@@ -220,11 +241,16 @@ def tempered_smc(
     config = config or TemperedSMCConfig()
     begun = time.monotonic()
     start_key, prior_key, key = jax.random.split(key, 3)
-    if initial is None:
-        q0, log_w0 = _prior_start(prior_key, shape=(config.populations, config.start_particles, dim))
+    shape = (config.populations, config.start_particles, dim)
+    if initial is not None and reference is not None:
+        raise ValueError("tempered_smc: give initial positions or a reference, not both")
+    if reference is not None:
+        q0, log_w0 = _reference_start(prior_key, reference, shape=shape)
+    elif initial is None:
+        q0, log_w0 = _prior_start(prior_key, shape=shape)
     else:
         q0, log_w0 = _proposal_start(*_checked(initial, config, dim))
-    state, info = _start(start_key, args, q0, log_w0, log_likelihood=log_likelihood, config=config)
+    state, info = _start(start_key, args, q0, log_w0, reference, log_likelihood=log_likelihood, config=config)
 
     gradients = float(config.populations * config.particles)
     kept: list[HMCState] = []  # the pools of the final stages
@@ -233,7 +259,15 @@ def tempered_smc(
 
     def samples(result: str = "underway") -> Posterior:
         chains = kept or [state.chain]
-        return _posterior(config, state, chains, acceptance, divergences, done, gradients, result)
+        told = {
+            "acceptance": jnp.asarray(np.float32(acceptance)),
+            "divergences": jnp.asarray(np.int32(divergences)),
+            "ancestors": jnp.asarray(np.int32(sum(len(np.unique(row)) for row in np.asarray(state.ancestor)))),
+            "stages": jnp.asarray(np.int32(done)),
+            "point_gradients": jnp.asarray(np.float32(gradients)),
+        }
+        beta, evidence, variance = (np.asarray(a, np.float64) for a in (state.beta, state.log_evidence, state.variance))
+        return gathered(chains[-config.keep :], beta, evidence, variance, config.evidence_power, told, result)
 
     try:
         while True:
@@ -253,7 +287,7 @@ def tempered_smc(
                 break
             final = bool(np.all(np.asarray(state.beta) == 1.0))
             state, info, pool = _stage(
-                jax.random.fold_in(key, done), state, args, log_likelihood=log_likelihood, config=config
+                jax.random.fold_in(key, done), state, args, reference, log_likelihood=log_likelihood, config=config
             )
             acceptance = float(np.mean(np.asarray(info.acceptance)))  # waits for the device
             if final:
@@ -293,42 +327,4 @@ def _progress(stage: int, state: _State, info: _Info, divergences: int, seconds:
         divergences=divergences,
         seconds=seconds,
         samples=samples,
-    )
-
-
-def _posterior(config, state: _State, kept: list[HMCState], acceptance, divergences, stages, gradients, result):
-    # NumPy: the number of kept pools varies, and nothing may compile for it.
-    positions = np.stack([np.asarray(chain.position) for chain in kept[-config.keep :]])  # [keep, m, n, d]
-    values = np.stack([np.asarray(chain.log_likelihood) for chain in kept[-config.keep :]])
-    populations = values.shape[1]
-    estimates = np.asarray(state.log_evidence, np.float64)
-    reached = bool(np.all(np.asarray(state.beta) == 1.0))
-    share, log_evidence = shares(estimates if reached else np.full(populations, np.nan), config.evidence_power)
-    error = float("nan")
-    if np.isfinite(log_evidence):
-        ratio = np.exp(estimates - log_evidence)
-        spread = np.std(ratio, ddof=1) / np.sqrt(populations) if populations > 1 else 0.0
-        within = np.sqrt(np.sum(ratio**2 * np.asarray(state.variance))) / populations
-        error = float(max(spread, within))
-    log_weights = np.broadcast_to((share - np.log(values.size / populations))[None, :, None], values.shape).ravel()
-    population = np.broadcast_to(np.arange(populations, dtype=np.int32)[None, :, None], values.shape).ravel()
-    return Posterior(
-        positions=jnp.asarray(positions.reshape(-1, positions.shape[-1])),
-        log_weights=jnp.asarray(log_weights.astype(np.float32)),
-        log_likelihoods=jnp.asarray(values.ravel()),
-        population=jnp.asarray(population),
-        log_evidence=jnp.asarray(np.float32(log_evidence)),
-        log_evidence_se=jnp.asarray(np.float32(error)),
-        diagnostics=Diagnostics(
-            acceptance=jnp.asarray(np.float32(acceptance)),
-            divergences=jnp.asarray(np.int32(divergences)),
-            r_hat=jnp.asarray(np.float32(split_r_hat(values.swapaxes(0, 1).reshape(populations, -1)))),
-            ess=jnp.asarray(np.float32(1.0 / np.sum(np.exp(2.0 * log_weights)))),
-            ancestors=jnp.asarray(np.int32(sum(len(np.unique(row)) for row in np.asarray(state.ancestor)))),
-            stages=jnp.asarray(np.int32(stages)),
-            point_gradients=jnp.asarray(np.float32(gradients)),
-            beta=jnp.asarray(np.asarray(state.beta)),
-            log_evidences=jnp.asarray(estimates.astype(np.float32)),
-        ),
-        result=result,
     )

@@ -100,12 +100,6 @@ class Pose(eqx.Module):
         return jnp.stack([c * u + s * v, -s * u + c * v, directions[..., 2] * jnp.ones_like(c)], axis=-1)
 
 
-def identity_pose() -> Pose:
-    """The pose of an object that stands canonically in the cube."""
-    zero = jnp.zeros(())
-    return Pose(yaw=zero, x=zero, y=zero, log_scale=zero, z=zero)
-
-
 class Diagnostics(eqx.Module):
     """What a sampler says of itself; trouble is a result that travels with the posterior."""
 
@@ -126,6 +120,7 @@ class Posterior(eqx.Module):
     positions: Float[Array, "s d"]
     log_weights: Float[Array, "s"]  # normalised: logsumexp is 0
     log_likelihoods: Float[Array, "s"]
+    log_density: Float[Array, "s"]  # of what each was drawn from, by its population's estimate (NaN: not known)
     population: Int[Array, "s"]  # independent population (or chain) of each sample: the source of Monte Carlo error
     log_evidence: Float[Array, ""]  # mean over populations, NaN for samplers that have none
     log_evidence_se: Float[Array, ""]

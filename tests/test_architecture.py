@@ -36,7 +36,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     # JAX is probnerf's; perception meets it only where arrays are handed over.
     "jax": ("probnerf/*", "perception/observe.py", "perception/controller.py", "perception/publish.py", "benchmarks/*"),
     "equinox": ("probnerf/*", "benchmarks/*"),
-    "optax": ("probnerf/train.py", "probnerf/variational.py", "probnerf/baselines/*"),
+    "optax": ("probnerf/ascent.py", "probnerf/train.py", "probnerf/baselines/*"),
     "safetensors": ("probnerf/store.py",),
     "blackjax": (),  # an independent sampler to test against
     "cv2": ("calibration/*", "perception/*", "probnerf/families/srn.py"),  # the last: PNG files, resized

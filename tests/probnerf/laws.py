@@ -9,14 +9,12 @@ import types
 from pathlib import Path
 from types import ModuleType
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probnerf.foam import Lattice
-from probnerf.model import Likelihood
-from probnerf.prior import PRESETS, ProbNeRF
+from probnerf import hmc, smc
+from probnerf.mixture import GaussianMixture
 
 DIM = 6
 SIGMAS = 4.5
@@ -114,6 +112,101 @@ def smc_takes_proposals_for_what_they_are(smc: ModuleType) -> None:
     assert_zero(np.exp(np.asarray(posterior.diagnostics.log_evidences, np.float64) - evidence) - 1.0)
 
 
+def reference_for(mean: np.ndarray, covariance: np.ndarray) -> GaussianMixture:
+    """Two Gaussians four deviations beside the posterior's, as wide, and the prior."""
+    root = np.linalg.cholesky(np.linalg.inv(covariance))
+    shift = 4.0 * np.linalg.inv(root).T[:, 0]
+    return GaussianMixture(
+        jnp.log(jnp.array([0.3, 0.5, 0.2])),
+        jnp.asarray(np.stack([mean + shift, mean - shift, 0 * mean]), jnp.float32),
+        jnp.asarray(np.stack([root, root, np.eye(DIM)]), jnp.float32),
+    )
+
+
+def hmc_leaves_a_target_between_reference_and_posterior_alone(hmc: ModuleType) -> None:
+    """Exact draws of r^(1 - beta) (prior x likelihood)^beta, Gaussian where r is, are still its draws."""
+    args, *_ = problem()
+    A, y = (np.asarray(a, np.float64) for a in args)
+    beta, precision, centre = 0.4, np.diag([4.0, 2.0, 9.0, 1.0, 0.5, 3.0]), np.linspace(-1.0, 1.0, DIM)
+    reference = GaussianMixture(
+        jnp.zeros(1), jnp.asarray(centre, jnp.float32)[None], jnp.asarray(np.sqrt(precision), jnp.float32)[None]
+    )
+    between = (1 - beta) * precision + beta * (np.eye(DIM) + A.T @ A)
+    middle = np.linalg.solve(between, (1 - beta) * precision @ centre + beta * A.T @ y)
+    start = np.random.default_rng(1).multivariate_normal(middle, np.linalg.inv(between), size=8192)
+    target = hmc.Target(linear, args, jnp.asarray(beta), None, reference)
+
+    @jax.jit
+    def moved(q):
+        def body(state, key):
+            state, info = hmc.hmc_step(key, state, target, 0.3, 3)
+            return state, info.acceptance.mean()
+
+        return jax.lax.scan(body, target.evaluate(q), jax.random.split(jax.random.key(0), 20))
+
+    state, acceptance = moved(jnp.asarray(start, jnp.float32))
+    if not 0.1 < float(acceptance.mean()) < 0.95:  # or the accept test is not needed
+        raise RuntimeError(f"the law asks nothing of this sampler: acceptance {float(acceptance.mean()):.2f}")
+    z = (np.asarray(state.position, np.float64) - middle) @ np.linalg.cholesky(between)
+    assert_zero(z)
+    assert_zero(z**2 - 1.0)
+
+
+def smc_finds_the_same_from_any_reference(smc: ModuleType) -> None:
+    """From a mixture that is off the evidence is unbiased, and the means are the posterior's."""
+    args, mean, covariance, evidence = problem()
+    config = smc.TemperedSMCConfig(populations=16, particles=48, start_particles=96, evidence_power=0.0)
+    reference = reference_for(mean, covariance)
+    posterior = smc.tempered_smc(jax.random.key(0), linear, args, DIM, config, reference=reference)
+    if int(posterior.diagnostics.stages) < config.final_stages + 2:  # or no stage's weights are needed
+        raise RuntimeError("the law asks nothing of this sampler: the first step reached the posterior")
+    assert_zero(np.exp(np.asarray(posterior.diagnostics.log_evidences, np.float64) - evidence) - 1.0)
+    z = (np.asarray(posterior.positions, np.float64) - mean) @ np.linalg.cholesky(np.linalg.inv(covariance))
+    groups = np.stack([z[np.asarray(posterior.population) == p] for p in range(16)])
+    assert_zero(groups.mean(axis=1))
+    assert np.abs((groups**2).mean(axis=(0, 1)) - 1.0).max() < 0.2
+
+
+def a_cut_run_goes_on_from_the_density_that_it_reached(populations: ModuleType) -> None:
+    """Cut between its reference and the posterior, and gone on with from the prior's side, evidence stays unbiased."""
+    args, mean, covariance, evidence = problem()
+    config = smc.TemperedSMCConfig(populations=16, particles=48, start_particles=96, evidence_power=0.0)
+    reference = reference_for(mean, covariance)
+    cut = smc.tempered_smc(jax.random.key(0), linear, args, DIM, config, reference=reference, stages=0)
+    if not 0.0 < float(cut.diagnostics.beta.max()) < 1.0:
+        raise RuntimeError("the law asks nothing: nothing was cut")
+    beta = np.asarray(cut.diagnostics.beta, np.float64)[np.asarray(cut.population)]
+    log_z = np.asarray(cut.diagnostics.log_evidences, np.float64)[np.asarray(cut.population)]
+    remade = populations.gathered(
+        [hmc.Target(linear, args, jnp.zeros(()), None, reference).evaluate(cut.positions.reshape(16, -1, DIM))],
+        np.asarray(cut.diagnostics.beta, np.float64), np.asarray(cut.diagnostics.log_evidences, np.float64),
+        np.zeros(16), 0.0, dict.fromkeys(("acceptance", "divergences", "ancestors", "stages", "point_gradients")), "",
+    )  # fmt: skip
+    prior = -0.5 * np.sum(np.asarray(cut.positions, np.float64) ** 2 + np.log(2 * np.pi), axis=1)
+    between = (1 - beta) * np.asarray(reference.log_density(cut.positions), np.float64)
+    between += beta * (prior + np.asarray(linear(args, cut.positions), np.float64))
+    np.testing.assert_allclose(remade.log_density, between - log_z, atol=2e-3)
+    start = populations.start_from(cut, 16)
+    after = smc.tempered_smc(jax.random.key(1), linear, args, DIM, config, initial=start)
+    assert_zero(np.exp(np.asarray(after.diagnostics.log_evidences, np.float64) - evidence) - 1.0)
+
+
+def a_mixture_has_the_density_that_it_draws_from(mixture: ModuleType) -> None:
+    """E_r[p / r] = 1 and E_r[q p / r] = 0 over the mixture's own draws, p the prior."""
+    rng = np.random.default_rng(2)
+    roots = np.stack([np.linalg.cholesky(a @ a.T + np.eye(3)) for a in 1.2 * rng.normal(size=(2, 3, 3))])
+    made = mixture.GaussianMixture(
+        jnp.log(jnp.array([0.2, 0.3, 0.5])),
+        jnp.asarray(np.concatenate([0.7 * rng.normal(size=(2, 3)), np.zeros((1, 3))]), jnp.float32),
+        jnp.asarray(np.concatenate([roots, 0.8 * np.eye(3)[None]]), jnp.float32),
+    )
+    q = made.draw(jax.random.key(0), 65536)
+    ratio = np.exp(-np.asarray(made.over_prior(q), np.float64))
+    assert_zero(ratio - 1.0)
+    assert_zero(ratio[:, None] * np.asarray(q, np.float64))
+    assert_zero(ratio[:, None] * (np.asarray(q, np.float64) ** 2 - 1.0))
+
+
 def resampling_gives_each_its_due(resampling: ModuleType) -> None:
     """Each particle is copied count x weight times, up to rounding, and a dead one never."""
     rng = np.random.default_rng(0)
@@ -126,14 +219,14 @@ def resampling_gives_each_its_due(resampling: ModuleType) -> None:
         assert np.all(np.abs(counts - 64 * w) < 1 + 1e-4) and np.all(counts[w == 0] == 0)
 
 
-def annealing_keeps_draws_of_its_last_temperatures(hmc: ModuleType) -> None:
+def annealing_keeps_draws_of_its_last_temperatures(annealed: ModuleType) -> None:
     """The last state of many short chains of the paper's sampler is a draw of the target that it ended at."""
     args, mean, covariance, _ = problem((30.0, 4.0), beta=1.0)
-    config = hmc.AnnealedHMCConfig(
+    config = annealed.AnnealedHMCConfig(
         chains=4096, iterations=40, leapfrog_steps=4, s_start=1.0, s_end=0.5, keep=1, tune_iterations=0,
         step_per_scale=0.5,
     )  # fmt: skip
-    posterior = hmc.annealed_hmc(jax.random.key(0), linear, args, DIM, config)
+    posterior = annealed.annealed_hmc(jax.random.key(0), linear, args, DIM, config)
     z = (np.asarray(posterior.positions, np.float64) - mean) @ np.linalg.cholesky(np.linalg.inv(covariance))
     assert_zero(z)
     assert_zero(z**2 - 1.0)
@@ -150,29 +243,3 @@ def vi_s_bound_is_the_evidence_at_the_posterior(vi: ModuleType) -> None:
     noise = jax.random.normal(jax.random.key(0), (64, 3))
     evidence = jnp.sum(-0.5 * jnp.log1p(precision) - 0.5 * precision / (1 + precision) * peak**2)
     np.testing.assert_allclose(vi.elbo_terms(best, likelihood, None, noise), evidence, atol=1e-4)
-
-
-def the_encoder_s_density_is_the_one_it_draws_from(proposal: ModuleType) -> None:
-    """E_q[p / q] = 1 over the proposal's own draws, p the prior, through a flow that stretches space."""
-    model = ProbNeRF(PRESETS["tiny"], jax.random.key(2))
-    leaves, tree = jax.tree.flatten(model.flow)
-    keys = jax.random.split(jax.random.key(5), len(leaves))
-    leaves = [
-        a + 0.15 * jax.random.normal(k, a.shape) if jnp.issubdtype(a.dtype, jnp.floating) else a
-        for k, a in zip(keys, leaves, strict=True)
-    ]
-    model = eqx.tree_at(lambda m: m.flow, model, jax.tree.unflatten(tree, leaves))
-    size = model.preset.image_size
-    picture = proposal.Picture(
-        jnp.full((size, size, 3), 0.5), jnp.full((size, size), 4.0), jnp.zeros((size, size)),
-        jnp.eye(4).at[:3, 3].set(jnp.array([0.0, 0.0, -4.0])), jnp.asarray(0.35),
-    )  # fmt: skip
-    likelihood = Likelihood(Lattice(8), sample_pose=False)
-    q, log_q = proposal.propose(
-        jax.random.key(0), model, likelihood, picture, jnp.zeros(5), 1, 32768, prior_share=0.05, flatten=0.05
-    )
-    log_p = -0.5 * jnp.sum(q**2 + jnp.log(2 * jnp.pi), axis=-1)
-    ratio = np.exp(np.asarray(log_p - log_q, np.float64))[0]
-    assert ratio.std() > 0.1
-    # eight starts share a pose, which here is known: all are independent
-    assert_zero(ratio - 1.0)

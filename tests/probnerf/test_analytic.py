@@ -25,8 +25,8 @@ from probnerf.analytic import (
     total_variation,
     yaw_histogram,
 )
+from probnerf.annealed import AnnealedHMCConfig, annealed_hmc
 from probnerf.foam import Lattice
-from probnerf.hmc import AnnealedHMCConfig, annealed_hmc
 from probnerf.model import CylinderModel, Likelihood, faces_of_view, log_likelihood, log_likelihood_one
 from probnerf.smc import tempered_smc
 from probnerf.types import OBJECT, Posterior

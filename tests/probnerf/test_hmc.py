@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from probnerf.annealed import AnnealedHMCConfig, annealed_hmc
 from probnerf.hmc import (
-    AnnealedHMCConfig,
     HMCState,
     Metric,
     StageInfo,
     Target,
-    annealed_hmc,
     energy_error,
     gradient_metric,
     hmc_step,
@@ -174,7 +173,7 @@ def test_gradients_of_draws_tell_the_stiff_directions_and_no_others():
     (A, y), mean, covariance = observed(200, precisions)
     draws = np.random.default_rng(0).multivariate_normal(mean, covariance, size=64)  # fewer draws than dimensions
     state = Target(linear, (A, y), jnp.ones(())).evaluate(jnp.asarray(draws, jnp.float32))
-    metric = gradient_metric(state.gradient, jnp.zeros(64), jnp.ones(()), 64)
+    metric = gradient_metric(state.gradient, jnp.zeros(64), 64)
     # Relative standard error of a variance from 64 draws: sqrt(2 / 64) = 0.18; 4 of them, and half on a square root.
     expected = 1 / np.sqrt(1 + np.array([k**2 / (1 + k) for k in precisions]))
     np.testing.assert_allclose(metric.frequency[:3], expected, rtol=0.36)
@@ -188,7 +187,7 @@ def test_moments_of_a_gaussian_of_unequal_scales(dim, precisions):
     draws = np.random.default_rng(1).multivariate_normal(mean, covariance, size=64)
     metric = gradient_metric(
         Target(linear, args, jnp.ones(())).evaluate(jnp.asarray(draws, jnp.float32)).gradient,
-        jnp.zeros(64), jnp.ones(()), min(dim, 64),
+        jnp.zeros(64), min(dim, 64),
     )  # fmt: skip
     q, info = run(
         jax.random.key(0), normal(13, 32, dim), args, metric, 0.35, log_likelihood=linear, steps=4, iterations=500
@@ -222,7 +221,7 @@ def test_a_dead_chain_does_not_poison_the_others():
 
 
 def test_at_beta_zero_the_likelihood_is_not_heard():
-    state = HMCState(jnp.zeros((1, 2)), jnp.array([-jnp.inf]), jnp.zeros((1, 2)))
+    state = HMCState(jnp.zeros((1, 2)), jnp.array([-jnp.inf]), jnp.zeros((1, 2)), jnp.zeros(1), jnp.zeros((1, 2)))
     v = jnp.ones((1, 2))
     assert float(energy_error(state, v, state, v, jnp.zeros(()))[0]) == 0.0
 

@@ -8,7 +8,7 @@ import pytest
 from blackjax.smc import extend_params, resampling
 from jaxtyping import Array, Float
 
-from probnerf.hmc import AnnealedHMCConfig, annealed_hmc
+from probnerf.annealed import AnnealedHMCConfig, annealed_hmc
 from probnerf.smc import TemperedSMCConfig, tempered_smc
 
 SIGMAS = 4.0

@@ -5,7 +5,7 @@ from types import ModuleType
 
 import pytest
 
-from probnerf import hmc, proposal, resampling, smc
+from probnerf import annealed, hmc, mixture, populations, resampling, smc
 from probnerf.baselines import vi
 from tests.probnerf import laws
 
@@ -14,9 +14,12 @@ LAWS = [
     (laws.smc_finds_evidence_and_moments, smc),
     (laws.resampling_gives_each_its_due, resampling),
     (laws.smc_takes_proposals_for_what_they_are, smc),
-    (laws.annealing_keeps_draws_of_its_last_temperatures, hmc),
+    (laws.smc_finds_the_same_from_any_reference, smc),
+    (laws.hmc_leaves_a_target_between_reference_and_posterior_alone, hmc),
+    (laws.a_cut_run_goes_on_from_the_density_that_it_reached, populations),
+    (laws.a_mixture_has_the_density_that_it_draws_from, mixture),
+    (laws.annealing_keeps_draws_of_its_last_temperatures, annealed),
     (laws.vi_s_bound_is_the_evidence_at_the_posterior, vi),
-    (laws.the_encoder_s_density_is_the_one_it_draws_from, proposal),
 ]
 
 
@@ -69,7 +72,10 @@ MUTATIONS = {
     ),
     "an un-annealed chain": (
         laws.annealing_keeps_draws_of_its_last_temperatures,
-        hmc_edited(("(config.s_end / scale) ** 2, base * scale", "(config.s_end / config.s_start) ** 2, base * scale")),
+        lambda: laws.mutant(
+            "probnerf.annealed",
+            ("(config.s_end / scale) ** 2, base * scale", "(config.s_end / config.s_start) ** 2, base * scale"),
+        ),
     ),
     "resampling off by one": (
         laws.resampling_gives_each_its_due,
@@ -93,7 +99,10 @@ MUTATIONS = {
     "moves at the temperature of the next stage's weights": (
         laws.smc_finds_evidence_and_moments,
         smc_edited(
-            ("args, state.beta[:, None], state.metric)", "args, jnp.ones_like(state.beta)[:, None], state.metric)")
+            (
+                "args, state.beta[:, None], state.metric, reference)",
+                "args, jnp.ones_like(state.beta)[:, None], state.metric, reference)",
+            )
         ),
     ),
     "starts weighed as if the prior had drawn them": (
@@ -104,11 +113,29 @@ MUTATIONS = {
         laws.vi_s_bound_is_the_evidence_at_the_posterior,
         lambda: laws.mutant("probnerf.baselines.vi", ("** 2 + fixed.log_std, axis", "** 2, axis")),
     ),
-    "a density without the flow's Jacobian": (
-        laws.the_encoder_s_density_is_the_one_it_draws_from,
-        lambda: laws.mutant(
-            "probnerf.proposal", ("precision * (z - mean) ** 2) + log_det", "precision * (z - mean) ** 2)")
-        ),
+    "an accept test without the reference": (
+        laws.hmc_leaves_a_target_between_reference_and_posterior_alone,
+        hmc_edited((" - (1.0 - beta) * (end.over_prior - start.over_prior)", "")),
+    ),
+    "weights of the likelihood alone": (
+        laws.smc_finds_the_same_from_any_reference,
+        smc_edited(("pool.log_ratio", "pool.log_likelihood")),
+    ),
+    "a start that forgets what drew it": (
+        laws.smc_finds_the_same_from_any_reference,
+        smc_edited(("value = value - reference.over_prior", "value = value - 0.0 * reference.over_prior")),
+    ),
+    "a cut run that forgets where it began": (
+        laws.a_cut_run_goes_on_from_the_density_that_it_reached,
+        lambda: laws.mutant("probnerf.populations", ("f = (1.0 - beta[:, None]) * over + ", "f = 0.0 * over + ")),
+    ),
+    "a mixture without its determinants": (
+        laws.a_mixture_has_the_density_that_it_draws_from,
+        lambda: laws.mutant("probnerf.mixture", ("self.log_weight + log_det + each", "self.log_weight + each")),
+    ),
+    "draws by the root where its transpose belongs": (
+        laws.a_mixture_has_the_density_that_it_draws_from,
+        lambda: laws.mutant("probnerf.mixture", ("transpose_a=True", "transpose_a=False")),
     ),
 }
 

@@ -5,9 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from probnerf import foam
-from probnerf.baselines.map import MAPConfig, ascend, log_posterior, map_estimate
+from probnerf.ascent import AdamConfig, ascend
+from probnerf.baselines.map import MAPConfig, map_estimate
 from probnerf.families.render import look_at, pinhole_rays
 from probnerf.model import CylinderModel, Likelihood, faces_of_view, pose_of, split_position
+from probnerf.modes import log_posterior
 from probnerf.types import FREE, OBJECT, Observation, Rays
 
 MODEL = CylinderModel()
@@ -45,7 +47,7 @@ def _to_target(args, batch, q):
 def test_ascent_reaches_the_top_of_a_bowl_from_every_start():
     target = jnp.array([0.5, -1.0, 2.0])
     start = jax.random.normal(jax.random.key(0), (5, 3))
-    q, values = ascend(_to_target, target, start, MAPConfig(steps=400))
+    q, values = ascend(_to_target, target, start, AdamConfig(steps=400))
     np.testing.assert_allclose(q, np.broadcast_to(target, (5, 3)), atol=1e-2)
     assert values.shape == (400, 5)
     np.testing.assert_allclose(values[0], -np.sum((start - target) ** 2, axis=-1), rtol=1e-5)
@@ -53,7 +55,7 @@ def test_ascent_reaches_the_top_of_a_bowl_from_every_start():
 
 def test_starts_do_not_touch():
     start = jax.random.normal(jax.random.key(1), (4, 3))
-    config = MAPConfig(steps=30)
+    config = AdamConfig(steps=30)
     together, _ = ascend(_to_target, jnp.ones(3), start, config)
     alone, _ = ascend(_to_target, jnp.ones(3), start[2:3], config)
     np.testing.assert_allclose(together[2:3], alone, atol=1e-6)
@@ -62,7 +64,7 @@ def test_starts_do_not_touch():
 def test_each_step_sees_its_own_batch():
     """Targets that alternate about a mean are ascended towards that mean."""
     batches = jnp.where(jnp.arange(600) % 2 == 0, 1.0, -1.0)[:, None]
-    q, values = ascend(_to_target, jnp.full(1, 0.3), jnp.zeros((1, 1)), MAPConfig(steps=600), batches)
+    q, values = ascend(_to_target, jnp.full(1, 0.3), jnp.zeros((1, 1)), AdamConfig(steps=600), batches)
     np.testing.assert_allclose(q, 0.3, atol=0.05)
     np.testing.assert_allclose(values[0, 0], -(1.3**2), rtol=1e-5)
 

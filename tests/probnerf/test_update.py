@@ -1,4 +1,4 @@
-"""A further view: a posterior that is reweighted and moved is the posterior of all views, by brute force."""
+"""A further view, and a run that goes on: the posterior of all views, by brute force."""
 
 from functools import cache
 
@@ -9,6 +9,7 @@ import pytest
 
 from probnerf.analytic import Args, integrate, scene, total_variation, yaw_histogram
 from probnerf.model import faces_of_view, log_likelihood, log_likelihood_one
+from probnerf.modes import ModesConfig, mixture_of_modes
 from probnerf.populations import start_from
 from probnerf.smc import TemperedSMCConfig, tempered_smc
 from probnerf.types import Posterior, joined
@@ -62,7 +63,10 @@ def test_a_second_view_that_shows_the_handle_collapses_the_yaw_to_the_truth() ->
     first, before = _first()
     args = _both(first, scene("hidden", True, azimuth=110.0, seed=1))
     grid = integrate(_each, args)
-    after = tempered_smc(jax.random.key(1), log_likelihood, args, 9, CONFIG, initial=_start(before))
+    yaw = jnp.arange(12) * (2 * jnp.pi / 12)
+    starts = jnp.zeros((12, 9)).at[:, 2].set(jnp.cos(yaw)).at[:, 3].set(jnp.sin(yaw))
+    reference = mixture_of_modes(args, starts, ModesConfig())
+    after = tempered_smc(jax.random.key(1), log_likelihood, args, 9, CONFIG, reference=reference)
     assert after.result == "converged"
     assert total_variation(_yaw(after), grid.histogram()) <= 0.1
     assert abs(float(after.log_evidence) - grid.log_evidence) <= max(0.5, 3 * float(after.log_evidence_se))

@@ -1,0 +1,59 @@
+"""Climbing from many starts at once: Adam on a batch of positions."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float
+
+# (shared arguments, this step's data, positions [p, d]) -> values [p]
+Objective = Callable[[Any, Any, Array], Array]
+
+
+@dataclass(frozen=True)
+class AdamConfig:
+    """Adam with a cosine schedule; rates are in units of the latents' prior standard deviation."""
+
+    steps: int = 300
+    learning_rate: float = 0.05
+    final_learning_rate: float = 0.002
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or not 0 < self.final_learning_rate <= self.learning_rate:
+            raise ValueError(
+                f"steps {self.steps} must be 1 or more, and the learning rate may only fall,"
+                f" from {self.learning_rate:g} to {self.final_learning_rate:g}"
+            )
+
+
+@partial(jax.jit, static_argnames=("objective", "config"))
+def ascend(
+    objective: Objective, args: Any, start: Float[Array, "p d"], config: AdamConfig, batches: Any = None
+) -> tuple[Float[Array, "p d"], Float[Array, "steps p"]]:
+    """Maximise `objective` from each start; also its values before every step.
+
+    `batches` is data with a leading axis of `steps`, one slice a step (a fresh subset of pixels, say), or None.
+    Starts do not touch: Adam works entry by entry. A gradient that is not finite counts as 0.
+    """
+    schedule = optax.cosine_decay_schedule(
+        config.learning_rate, config.steps, config.final_learning_rate / config.learning_rate
+    )
+    adam = optax.adam(schedule)
+
+    def step(carry, batch):
+        q, moments = carry
+
+        def loss(q):
+            values = objective(args, batch, q)
+            return -jnp.sum(values), values
+
+        gradient, values = jax.grad(loss, has_aux=True)(q)
+        update, moments = adam.update(jnp.where(jnp.isfinite(gradient), gradient, 0.0), moments, q)
+        return (optax.apply_updates(q, update), moments), values
+
+    (q, _), values = jax.lax.scan(step, (start, adam.init(start)), batches, length=config.steps)
+    return q, values
