@@ -19,6 +19,7 @@ from functools import cached_property
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from perception.hypotheses import Hypotheses
 from perception.observe import ObjectFrame, ObserveConfig, observe
@@ -28,9 +29,11 @@ from perception.segment import Segment
 from perception.source import Frame
 from probnerf.families.render import look_at, pinhole_rays
 from probnerf.hmc import StageInfo
-from probnerf.infer import InferConfig, crossings_of, infer, likelihood_of
+from probnerf.infer import InferConfig, asks_encoder, crossings_of, encoder_guess, infer, likelihood_of, modes_of
+from probnerf.mixture import GaussianMixture
 from probnerf.model import Likelihood
 from probnerf.populations import pooled
+from probnerf.prior import ProbNeRF
 from probnerf.proposal import Picture
 from probnerf.store import Prior
 from probnerf.types import OBJECT, UNKNOWN, Observation, Posterior
@@ -113,6 +116,7 @@ def infer_view(
     *,
     seed: int = 0,
     before: Posterior | None = None,
+    fresh: bool = True,
     deadline: float | None = None,
     stages: int | None = None,
     on_stage: Callable[[StageInfo], bool | None] | None = None,
@@ -120,11 +124,12 @@ def infer_view(
 ) -> Estimate:
     """Sample the posterior of a view and publish it, with as much model as it takes.
 
-    `before` is the posterior of an earlier view of the same cube; only the largest level goes on from it. `stages` and
-    `deadline` are for all levels together. A level that is cut short leaves the last whole answer standing.
+    `before` is a posterior of the same view that was cut short; only the largest level goes on from it. `fresh`:
+    nothing is known of the object, so that the encoder's guess is worth handing out at once. `stages` and `deadline`
+    are for all levels together. A level that is cut short leaves the last whole answer standing.
     """
     begun = time.monotonic()
-    work = _Work(view, prior, config, seed, before, deadline, stages, on_stage, on_answer)
+    work = _Work(view, prior, config, seed, before, fresh, deadline, stages, on_stage, on_answer)
     grows = before is None and config.infer.method == "tempered_smc"
     last = config.levels[-1] if grows else 1
     plan = [(level, 0) for level in config.levels[:-1] if grows] + [
@@ -172,10 +177,13 @@ class _Work:
     config: ControllerConfig
     seed: int
     before: Posterior | None
+    fresh: bool
     deadline: float | None
     cap: int | None  # stages
     on_stage: Callable[[StageInfo], bool | None] | None
     on_answer: Callable[[Hypotheses], None] | None
+    searched: bool = False
+    reference: GaussianMixture | None = None  # where all runs begin, if not at the prior
     stages: int = 0  # done
     point_gradients: float = 0.0
     answer: Hypotheses | None = None  # of a whole level
@@ -191,9 +199,7 @@ class _Work:
 
     @cached_property
     def picture(self) -> Picture | None:
-        """What the encoder sees. It was trained on objects with ranges; without, its starts are no better than the
-        prior's: on eight validation objects a third of their effective number at a temperature of 10.
-        """
+        """What the encoder sees. It was trained on objects with ranges; without, sampling begins at the prior."""
         if self.view.frame.depth is None:
             return None
         return crop(self.view.frame, self.view.segment, self.view.object_frame, self.prior.model.preset.image_size)
@@ -202,13 +208,15 @@ class _Work:
         """One run of `infer` at a level."""
         observation = self.view.observation
         key = jax.random.key(self.seed)
+        if not self.searched and self.before is None:
+            self._search(jax.random.fold_in(key, 1))
         self.stage_s, self.since = [], time.monotonic()
         posterior, likelihood = infer(
             jax.random.fold_in(key, 10 * level + run) if self.stages else key,
             self.prior.model,
             observation,
             _lesser(self.config.infer, level),
-            picture=self.picture,
+            reference=self.reference,
             before=self.before,
             on_stage=self._told,
             deadline=self.deadline,
@@ -218,19 +226,37 @@ class _Work:
         self.point_gradients += float(posterior.diagnostics.point_gradients) * crossings_of(likelihood, observation)
         return posterior
 
+    def _search(self, key: Array) -> None:
+        """Ask the encoder, hand out what it says where nothing better is known, and climb from there: once a view."""
+        self.searched, config, model = True, self.config.infer, self.prior.model
+        if config.method != "tempered_smc" or not asks_encoder(config, model, self.picture):
+            return
+        assert isinstance(model, ProbNeRF) and self.picture is not None
+        if self.on_answer is not None and self.fresh:
+            self._answer(encoder_guess(key, model, self.likelihood, self.view.observation, self.picture))
+        self.reference = modes_of(key, model, self.view.observation, config, self.picture)
+        climbed = config.modes.gradients(self.likelihood.dim(model))
+        self.point_gradients += climbed * crossings_of(self.likelihood, self.view.observation)
+
     def _told(self, info: StageInfo) -> bool | None:
         if self.on_stage is not None and self.on_stage(replace(info, stage=self.stages + info.stage)):
             return True
         now = time.monotonic()
         self.stage_s.append(now - self.since)
-        # the first answer at once; a later one when the time it takes is a fifth of what went by; none that is
-        # underway once a level is whole
+        # without an encoder's guess the first answer at once; a later one when the time it takes is a fifth of what
+        # went by; none that is underway once a level is whole
         if self.on_answer is not None and self.answer is None and now - self.answered >= 4.0 * self.answering:
-            self.on_answer(self.publish(info.samples(), self.config.first_hypotheses))
-            self.answered = time.monotonic()
-            self.answering = self.answered - now
+            self._answer(info.samples())
         self.since = time.monotonic()
         return None
+
+    def _answer(self, posterior: Posterior) -> None:
+        """Hand out what there is so far, from fewer shapes."""
+        assert self.on_answer is not None
+        begun = time.monotonic()
+        self.on_answer(self.publish(posterior, self.config.first_hypotheses))
+        self.answered = time.monotonic()
+        self.answering = self.answered - begun
 
     def publish(self, posterior: Posterior, count: int) -> Hypotheses:
         """The samples at hand as planners read them."""

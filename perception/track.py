@@ -1,10 +1,11 @@
 """Objects over time: each frame adds to what is known of them, or says that they moved.
 
 The latents live in the cube of an object's first frame. A later frame of the same still object is observed in that cube
-(its camera moves, its rays with it), and the posterior of the views so far is reweighted and moved to that of all
-(`probnerf.infer.start_from`). What a frame adds is measured by the voxels that it is the first to see. One that adds
-nothing shares its errors with those before it, as pictures from one tripod do: it only has to agree, and
-the answer is published again under its stamp. A frame that the hypotheses do not explain shows an object that moved.
+(its camera moves, its rays with it), and the posterior of all views is inferred afresh: what is left of the one before
+knows fewer modes than a new search finds. What a frame adds is measured by the voxels that it is the first to see. One
+that adds nothing shares its errors with those before it, as pictures from one tripod do: it only has to agree, and the
+answer is published again under its stamp, or gone on with where it was cut short (`probnerf.populations.start_from`). A
+frame that the hypotheses do not explain shows an object that moved.
 """
 
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from perception.controller import ControllerConfig, Estimate, infer_view
+from perception.controller import ControllerConfig, infer_view
 from perception.hypotheses import Hypotheses
 from perception.observe import ObjectFrame, object_frame, observe
 from perception.publish import View
@@ -40,7 +41,6 @@ class TrackConfig:
     adds: float = 0.08  # share of the unseen space above the plane that a frame must see first; noise sees 0.01 to 0.03
     checked: int = 32  # hypotheses that a frame is held against: the best of them counts
     moved_below: float = 0.8  # share of telling pixels explained by the best of them under which the object has moved
-    starts: float = 3.0  # effective samples that a further view must leave; with fewer all views are inferred afresh
     reach: float = 0.6  # half extents; without a label map the object nearer than this is the same one
     plane_degrees: float = 2.0  # without T_world_camera the camera stands still while its plane does, to so much
     plane_m: float = 0.01
@@ -165,38 +165,21 @@ class Tracker:
             self._tracks[look.object_id] = replace(track, hypotheses=look.hypotheses)
             return Update(look.change, look.hypotheses, 0, look.agreement, 0.0)
         before = None
-        if track is not None and np.isfinite(np.asarray(track.posterior.diagnostics.log_evidences)).all():
-            before = track.posterior
-        poor = False
-
-        def told(info: StageInfo) -> bool | None:
-            nonlocal poor
-            if info.stage == 0 and before is not None and max(info.ess) < self.track.starts:
-                poor = True
-                return True
-            return on_stage(info) if on_stage is not None else None
-
-        def answer(h: Hypotheses) -> None:
-            if on_answer is not None and not poor:
-                on_answer(h)
-
-        def sample(before: Posterior | None) -> Estimate:
-            return infer_view(
-                look._view,
-                self.prior,
-                self.config,
-                seed=look.seed,
-                before=before,
-                deadline=deadline,
-                stages=stages,
-                on_stage=told,
-                on_answer=answer,
-            )
-
-        result = sample(before)
-        if poor:  # nothing that was thought possible agrees with this view
-            before, poor = None, False
-            result = sample(None)
+        if look.change == "continued" and track is not None:
+            estimates = np.asarray(track.posterior.diagnostics.log_evidences)
+            before = track.posterior if np.isfinite(estimates).all() else None
+        result = infer_view(
+            look._view,
+            self.prior,
+            self.config,
+            seed=look.seed,
+            before=before,
+            fresh=look.hypotheses is None,
+            deadline=deadline,
+            stages=stages,
+            on_stage=on_stage,
+            on_answer=on_answer,
+        )
         self._tracks[look.object_id] = _Track(
             anchor=look._view.object_frame if track is None else track.anchor,
             first=look._view.frame if track is None else track.first,

@@ -12,7 +12,7 @@ from perception.track import Tracker
 def warm_up(tracker: Tracker) -> None:
     """Look at an object of the shipped recording at every level, with a tracker of the same prior and configuration.
 
-    Raises KeyboardInterrupt where Ctrl-C ended it, which the sampler keeps for itself.
+    Raises KeyboardInterrupt where Ctrl-C ended it, which the sampler may keep for itself.
 
     A full garbage collection stops every thread. Over what JAX keeps of its programs it takes 0.1 to 0.3 s, several
     periods of a camera, so what is there by then is set aside from it.
@@ -23,7 +23,7 @@ def warm_up(tracker: Tracker) -> None:
         for level in levels:
             config = replace(tracker.config, levels=(level,))
             trial = replace(tracker, config=config, _tracks={}, _names=set())
-            for _ in range(1 + (level == levels[-1])):  # a further view goes on from the last level
+            for _ in range(1 + (level == levels[-1])):  # an answer that was cut short is gone on with
                 update = trial.update(frame, segment(frame)[0], stages=1, on_answer=lambda _: None)
                 if update.hypotheses.result == "interrupted":
                     raise KeyboardInterrupt

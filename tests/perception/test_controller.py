@@ -14,7 +14,8 @@ from probnerf.store import load_prior
 from tests.perception.test_track import frame_from
 
 CONFIG = ControllerConfig(
-    infer=InferConfig(smc=replace(quick_smc(), populations=2, particles=32, start_particles=128)),
+    # no climbs, which cost every level the same
+    infer=InferConfig(smc=replace(quick_smc(), populations=2, particles=32, start_particles=128), encoder_starts=False),
     hypotheses=8,
     first_hypotheses=4,
     grid=32,
