@@ -157,7 +157,8 @@ def _measure(prior: Prior, methods: list[Method], conditions: list[str], n: int,
 
 def settings_of(method: Method, config: ControllerConfig) -> Line:
     """A method's own settings, and a digest of all else that observation and inference were set to."""
-    infer = {name: value for name, value in asdict(config.infer).items() if method.smc or name != "smc"}
+    own = ("smc", "modes")  # of the sampler, which other methods do not have
+    infer = {name: value for name, value in asdict(config.infer).items() if method.smc or name not in own}
     shared = {"infer": infer, "observe": asdict(config.observe), "hypotheses": config.hypotheses}
     digest = sha256(json.dumps(shared, sort_keys=True, default=str).encode()).hexdigest()[:8]
     return {**method.settings, "config": digest}

@@ -18,20 +18,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks.rivals import RivalConfig, encoder_alone, encoder_positions
+from benchmarks.rivals import RivalConfig, encoder_alone
 from benchmarks.scene import GRID, VesselView
 from benchmarks.score import Answer
 from perception.controller import ControllerConfig, crop, estimate
 from perception.observe import ObjectFrame, observe
 from perception.seen import answered_voxels
-from probnerf.baselines.map import log_posterior, map_estimate
+from probnerf.annealed import AnnealedHMCConfig
+from probnerf.baselines.map import map_estimate
 from probnerf.baselines.vi import VIConfig, mean_field
-from probnerf.hmc import AnnealedHMCConfig
 from probnerf.infer import crossings_of, infer, likelihood_of, opacity_grids, scaled_about, without_sizes
 from probnerf.model import Likelihood, faces_of_view, log_likelihood
+from probnerf.modes import log_posterior
 from probnerf.occupancy import coarsen, solid
 from probnerf.populations import thin
-from probnerf.proposal import Picture
+from probnerf.proposal import Picture, encoder_positions, even_yaws
 from probnerf.store import Prior
 from probnerf.types import Diagnostics, Observation, Posterior
 
@@ -114,7 +115,7 @@ def _weighted(positions: Float[Array, "s d"], weights: Float[np.ndarray, "s"], g
         nan, zero, nan, nan, zero, zero, jnp.asarray(np.float32(gradients)), jnp.ones(1), jnp.full(1, nan)
     )
     values, population = jnp.full(count, nan), jnp.zeros(count, jnp.int32)
-    return Posterior(positions, log_weights, values, population, nan, nan, diagnostics, "")
+    return Posterior(positions, log_weights, values, values, population, nan, nan, diagnostics, "")
 
 
 def _sampled(q: Question, posterior: Posterior, evaluations: float = 0.0) -> Sampled:
@@ -138,7 +139,7 @@ def _map() -> Method:
     fit = config.fit
 
     def sample(q: Question, _: bool) -> Sampled:
-        starts = encoder_positions(q.key, q.prior.model, q.picture, config.yaws, 1, 0.0)
+        starts = encoder_positions(q.key, q.prior.model, q.picture, even_yaws(config.yaws), 1, 0.0)
         best, _ = map_estimate(q.prior.model, q.likelihood, q.observed[0], starts, fit)
         gradients = config.yaws * fit.screen_steps + fit.survivors * fit.steps
         return _sampled(q, _weighted(best[None], np.ones(1), gradients), evaluations=config.yaws + fit.survivors)
@@ -151,7 +152,7 @@ def _vi(config: VIConfig) -> Method:
 
     def sample(q: Question, _: bool) -> Sampled:
         args = q.arguments
-        starts = encoder_positions(q.key, q.prior.model, q.picture, yaws, 1, 0.0)
+        starts = encoder_positions(q.key, q.prior.model, q.picture, even_yaws(yaws), 1, 0.0)
         at = int(jnp.argmax(jnp.nan_to_num(jax.jit(log_posterior)(args, None, starts), nan=-jnp.inf)))
         found, _ = mean_field(q.key, log_likelihood, args, starts[at], config)
         count = q.config.hypotheses
@@ -239,9 +240,9 @@ METHODS = (
     _estimate("smc, smallest level", "smallest level", "x1", stages=60, levels=(3,)),
     _estimate("smc, smallest level, 4 runs", "smallest level", "x4", stages=240, levels=(3,), runs=4),
     _estimate(
-        "smc, no encoder",
+        "smc, from the prior",
         "lever off",
-        "E no encoder starts",
+        "P from the prior",
         stages=60,
         infer={"encoder_starts": False},
         conditions=TELLING,

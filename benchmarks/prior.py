@@ -29,7 +29,7 @@ from scipy import ndimage
 from benchmarks.rows import Row
 from benchmarks.summary import interval, mean_rows, say, table
 from probnerf import foam
-from probnerf.baselines.map import MAPConfig, ascend
+from probnerf.ascent import AdamConfig, ascend
 from probnerf.families.draw import KINDS, TEXTURES
 from probnerf.families.render import handle_occupancy, look_at, pinhole_rays, solid_occupancy, trace
 from probnerf.families.tabletop import TEST_SEEDS, TabletopObject, sample_object
@@ -51,7 +51,7 @@ PSNR_DB, IOU, RECALLED = 25.0, 0.8, 0.9  # the gate
 class GateConfig:
     """How the held-out objects are seen and rebuilt."""
 
-    fit: MAPConfig = field(default_factory=MAPConfig)
+    fit: AdamConfig = field(default_factory=AdamConfig)
     rays: int = 256  # pixels drawn afresh every step, from the four views
     counted: float = 1024.0  # independent residuals that they stand for
     size: int = 64  # pixels a side
@@ -279,7 +279,7 @@ def main(
         rays: pixels drawn in each step
     """
     model = load_prior(prior).model
-    config = GateConfig(fit=MAPConfig(steps=steps), rays=rays)
+    config = GateConfig(fit=AdamConfig(steps=steps), rays=rays)
     rebuilt: list[Rebuilt] = []
     for r in rebuild_all(model, TEST_SEEDS[: min(n, 10) if quick else n], config):
         rebuilt.append(r)

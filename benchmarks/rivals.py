@@ -16,13 +16,13 @@ from perception.seen import answered_voxels
 from perception.segment import Segment
 from perception.source import Frame
 from probnerf.baselines.map import MAPConfig, map_estimate
-from probnerf.infer import likelihood_of, opacity_grids
-from probnerf.model import POSE_SIZE, Likelihood, faces_of_view, log_likelihood
+from probnerf.infer import encoder_guess, likelihood_of, opacity_grids
+from probnerf.model import Likelihood
 from probnerf.occupancy import coarsen, solid
 from probnerf.prior import ProbNeRF
-from probnerf.proposal import Picture, potential_at
+from probnerf.proposal import Picture, encoder_positions, even_yaws
 from probnerf.store import Prior
-from probnerf.types import Observation, Pose
+from probnerf.types import Observation
 
 POSTERIOR, PRIOR, ENCODER, MAP = METHODS = ("tempered_smc", "prior alone", "encoder alone", "map")
 
@@ -68,7 +68,7 @@ def answers(
     drawn, weights = encoder_alone(key, model, likelihood, observation, picture, rivals)
     result[ENCODER] = answer(drawn, weights, begun)
     begun = time.monotonic()
-    starts = encoder_positions(key, model, picture, rivals.yaws, 1, 0.0)
+    starts = encoder_positions(key, model, picture, even_yaws(rivals.yaws), 1, 0.0)
     best, _ = map_estimate(model, likelihood, observation, starts, rivals.fit)
     result[MAP] = answer(best[None], np.ones(1), begun)
     return result
@@ -90,39 +90,6 @@ def warm_up(
 def encoder_alone(
     key: Array, model: ProbNeRF, likelihood: Likelihood, observation: Observation, picture: Picture, config: RivalConfig
 ) -> tuple[Float[Array, "s d"], Float[np.ndarray, "s"]]:
-    """Draws z_kj ~ q(z | picture, yaw_k) over a grid of yaws, weighted by how well each yaw explains the view.
-
-    The weight of yaw k is its mean likelihood, W_k = sum_j p(observation | z_kj, yaw_k) / J, shared evenly by its J
-    draws: within a yaw the encoder is taken at its word. x, y and scale are perception's guess.
-    """
-    positions = encoder_positions(key, model, picture, config.yaws, config.draws, 1.0)
-    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
-    values = np.asarray(jax.jit(log_likelihood)(args, positions), np.float64).reshape(config.yaws, config.draws)
-    values = np.where(np.isfinite(values), values, -np.inf)
-    each = np.exp(values - values.max()).mean(axis=1)
-    return positions, np.repeat(each / each.sum() / config.draws, config.draws)
-
-
-def encoder_positions(
-    key: Array, model: ProbNeRF, picture: Picture, yaws: int, draws: int, spread: float
-) -> Float[Array, "yaws_draws d"]:
-    """Positions with z = mean + spread N(0, 1 / precision) of the encoder at evenly spaced yaws, `draws` at each."""
-    noise = jax.random.normal(key, (yaws, draws, model.latent))
-    return _encoder_positions(model, picture, noise, spread)
-
-
-@jax.jit
-def _encoder_positions(
-    model: ProbNeRF, picture: Picture, noise: Float[Array, "y j k"], spread: float
-) -> Float[Array, "y_j d"]:
-    yaws = jnp.arange(noise.shape[0]) * (2.0 * jnp.pi / noise.shape[0]) - jnp.pi
-    zero = jnp.zeros(())
-
-    def at(yaw: Array, noise: Array) -> Array:
-        mean, precision = potential_at(model, picture, Pose(yaw, zero, zero, zero, zero), 1.0)
-        z = mean + spread * noise / jnp.sqrt(precision)
-        z_tilde = jax.vmap(lambda one: model.flow.inverse(one)[0])(z)
-        pose = jnp.zeros((len(noise), POSE_SIZE)).at[:, 0].set(jnp.cos(yaw)).at[:, 1].set(jnp.sin(yaw))
-        return jnp.concatenate([z_tilde, pose], axis=-1)
-
-    return jax.vmap(at)(yaws, noise).reshape(-1, noise.shape[-1] + POSE_SIZE)
+    """The encoder's guess: positions and weights."""
+    guess = encoder_guess(key, model, likelihood, observation, picture, config.yaws, config.draws)
+    return guess.positions, np.exp(np.asarray(guess.log_weights, np.float64))
