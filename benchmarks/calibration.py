@@ -50,6 +50,7 @@ from benchmarks.summary import mean_rows, say, table
 from perception.controller import ControllerConfig
 from perception.simulate import Scene, render
 from probnerf.families.tabletop import TEST_SEEDS
+from probnerf.infer import likelihood_settings
 from probnerf.metrics import (
     ECE_BINS,
     best_of_k_iou,
@@ -162,25 +163,24 @@ def main(
     if unknown := set(asked) - set(SORTS):
         raise ValueError(f"no condition {sorted(unknown)}; there are: {'; '.join(SORTS)}")
     loaded, config, rivals = load_prior(prior), ControllerConfig(), RivalConfig()
-    told = json.dumps([asdict(config), asdict(rivals)], sort_keys=True, default=str)
-    digest = sha256(told.encode()).hexdigest()[:12] + "-quick" * quick  # whose base rate is of fewer objects
-    common = {"prior": loaded.hash, "settings": {"digest": digest}, "seed": seed}
+    common = {"prior": loaded.hash, "seed": seed}
+    settings = _settings(config, rivals, quick)
     if not only_chart:
         done = {key(line) for line in read_lines(results)}
         rate = base_rate(128 if quick else 1024, config=config.observe)
         for condition in asked:
-            own = {**common, "condition": condition}
 
-            def known(number: int, own: Line = own) -> bool:
-                return all(key({**own, "method": m, "object": number}) in done for m in METHODS)
+            def missing(number: int, condition: str = condition) -> dict[str, Line]:
+                own = {**common, "condition": condition, "object": number}
+                lines = {m: {**own, "method": m, "settings": settings[m]} for m in METHODS}
+                return {m: line for m, line in lines.items() if key(line) not in done}
 
-            for number, view in views(condition, n, known):
+            for number, view in views(condition, n, lambda number: not missing(number)):
                 if view is None:
                     continue
-                given = answers(view, loaded, config, rivals, seed, None, 240)
-                answered = {
-                    m: {**own, "method": m, "object": number, **judged(view, a, rate, seed)} for m, a in given.items()
-                }
+                asked_of = missing(number)
+                given = answers(view, loaded, config, rivals, seed, None, 240, asked_of)
+                answered = {m: {**asked_of[m], **judged(view, a, rate, seed)} for m, a in given.items()}
                 for line in answered.values():
                     append_line(results, line)
                 say(f"{condition}, {number}: " + ", ".join(f"{m} {v['hidden_nll']:.3f}" for m, v in answered.items()))
@@ -190,6 +190,17 @@ def main(
     rows = _rows(lines)
     _draw(lines, out / "calibration.png")
     return rows
+
+
+def _settings(config: ControllerConfig, rivals: RivalConfig, quick: bool) -> dict[str, Line]:
+    """What each method's answers depend on. The rivals' outlast a change of the sampler."""
+    shared = [asdict(likelihood_settings(config.infer)), asdict(config.observe), config.grid, config.hypotheses]
+
+    def digest(*told: object) -> Line:
+        text = json.dumps(told, sort_keys=True, default=str)
+        return {"digest": sha256(text.encode()).hexdigest()[:12] + "-quick" * quick}  # a base rate of fewer objects
+
+    return {m: digest(asdict(config)) if m == POSTERIOR else digest(shared, asdict(rivals)) for m in METHODS}
 
 
 def pooled_ece(lines: list[Line], resamples: int = 400) -> tuple[float, float, float]:

@@ -89,7 +89,7 @@ def main(out: Path, quick: bool = False, prior: Path | None = None, n: int = 8, 
     """
     n = min(n, 2) if quick else n
     loaded, config = load_prior(prior), ControllerConfig()
-    amounts = {CONTROLLER: config, LARGEST: replace(config, levels=(1,), tolerance=0.0)}
+    amounts = {CONTROLLER: config, LARGEST: replace(config, tolerance=0.0)}
     rate = base_rate(128 if quick else 1024, config=config.observe)
     spent: dict[str, list[Spent]] = {condition: [] for condition in CONDITIONS}
     warm = False
@@ -114,8 +114,8 @@ def main(out: Path, quick: bool = False, prior: Path | None = None, n: int = 8, 
 
     for condition in CONDITIONS:
         for view in scenes(condition, n):
-            if not warm:  # every level, once
-                measured(view, replace(config, tolerance=0.0, runs=1))
+            if not warm:  # once
+                measured(view, replace(config, particles=1))
                 warm = True
             got = {method: measured(view, amount) for method, amount in amounts.items()}
             values = {method: values for method, (values, _) in got.items()}

@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from perception.controller import ControllerConfig
 from perception.source import Frame
+from probnerf.smc import TemperedSMCConfig
 
 
 def intrinsics(frame: Frame, amount: float) -> Frame:
@@ -125,11 +126,13 @@ def _infer(name: str) -> Callable[[ControllerConfig, float], ControllerConfig]:
 
 
 def _particles(config: ControllerConfig, amount: float) -> ControllerConfig:
-    smc = config.infer.smc
-    smc = replace(
-        smc, particles=max(2, int(smc.particles * amount)), start_particles=max(2, int(smc.start_particles * amount))
-    )
-    return replace(config, infer=replace(config.infer, smc=smc))
+    def fewer(smc: TemperedSMCConfig) -> TemperedSMCConfig:
+        particles, start = (max(2, int(n * amount)) for n in (smc.particles, smc.start_particles))
+        return replace(smc, particles=particles, start_particles=start)
+
+    own = config.infer
+    infer = replace(own, smc=fewer(own.smc), smc_from_prior=fewer(own.smc_from_prior))
+    return replace(config, infer=infer, particles=max(1, int(config.particles * amount)))
 
 
 def _rays(config: ControllerConfig, amount: float) -> ControllerConfig:

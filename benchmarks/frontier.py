@@ -11,8 +11,8 @@ The first vessels of the test seeds with a handle for which there is a view that
 - seconds: of one object, from frame to solid grids; work: seconds x the speed of the machine's matrix product beside
   them, which another machine can be compared by.
 - point_gradients: see `benchmarks.methods`. The encoder alone has point_evaluations.
-- hidden_nll_above_paper, _above_smc: paired over objects with the paper's full schedule, and with one run of the
-  sampler at its largest level, which levers are taken from one at a time.
+- hidden_nll_above_paper, _above_smc: paired over objects with the paper's full schedule, and with one run
+  of the sampler, which levers are taken from one at a time.
 
 Results are appended to a file, vessel by vessel, and what is there is not made again: Ctrl-C any time, and go on later.
 """
@@ -157,7 +157,7 @@ def _measure(prior: Prior, methods: list[Method], conditions: list[str], n: int,
 
 def settings_of(method: Method, config: ControllerConfig) -> Line:
     """A method's own settings, and a digest of all else that observation and inference were set to."""
-    own = ("smc", "modes")  # of the sampler, which other methods do not have
+    own = ("smc", "smc_from_prior", "modes")  # of the sampler, which other methods do not have
     infer = {name: value for name, value in asdict(config.infer).items() if method.smc or name not in own}
     shared = {"infer": infer, "observe": asdict(config.observe), "hypotheses": config.hypotheses}
     digest = sha256(json.dumps(shared, sort_keys=True, default=str).encode()).hexdigest()[:8]

@@ -28,7 +28,6 @@ STYLE = {  # colour and marker of each group
     "paper": ("k", "o"),
     "fixed temperature": ("tab:gray", "X"),
     "smc": ("tab:blue", "*"),
-    "smallest level": ("tab:cyan", "s"),
     LEVERS: ("tab:purple", ""),
     "controller": ("tab:green", "D"),
 }
@@ -38,11 +37,10 @@ LEGEND = {
     "vi": "mean-field VI",
     "paper": "the paper's annealed HMC",
     "fixed temperature": "HMC at one temperature",
-    "smc": "tempered SMC, largest level, by runs",
-    "smallest level": "... smallest level, by runs",
+    "smc": "tempered SMC, by runs",
     "controller": "controller, by budget",
 }
-JOINED = ("paper", "smc", "smallest level", "controller")
+JOINED = ("paper", "smc", "controller")
 
 
 def draw_frontier(rows: Sequence[Row], path: Path) -> None:

@@ -191,24 +191,23 @@ def _estimate(
     budget_s: float | None = None,
     infer: dict[str, Any] | None = None,
     smc: dict[str, Any] | None = None,
-    levels: tuple[int, ...] | None = (1,),
-    runs: int = 1,
+    particles: int | None = 1,
     conditions: tuple[str, ...] = CONDITIONS,
 ) -> Method:
     """Perception's own way, with other numbers of `InferConfig` and of its `smc`.
 
-    `runs` at the last of fixed `levels`, or with None the controller's own choice.
+    `particles` of all runs together (of one: 1), or with None the controller's own choice.
     """
 
     def sample(q: Question, short: bool) -> Sampled:
-        """Perception's answer; a short one goes through every level that the method may use."""
-        sampler = replace(q.config.infer, **(infer or {}), smc=replace(q.config.infer.smc, **(smc or {})))
+        """Perception's answer."""
+        own = q.config.infer
+        populations = {name: replace(getattr(own, name), **(smc or {})) for name in ("smc", "smc_from_prior")}
+        sampler = replace(own, **(infer or {}), **populations)
         limits = {"stages": None if stages is None else 2} if short else {"stages": stages, "budget_s": budget_s}
         config = replace(q.config, infer=sampler)
-        if levels is not None:
-            config = replace(config, levels=levels, runs=runs, unexplained=1.0, tolerance=0.0)
-        elif short:
-            config = replace(config, runs=1, tolerance=0.0)  # through all levels
+        if particles is not None:
+            config = replace(config, particles=particles, unexplained=1.0, tolerance=0.0)
         begun = time.monotonic()
         found = estimate(q.view.frame, q.view.segment, q.prior, config, seed=q.seed, **limits)
         seconds = time.monotonic() - begun
@@ -216,10 +215,10 @@ def _estimate(
         cube, likelihood = found.object_frame, found.likelihood
         return Sampled(found.posterior, found.observation, likelihood, cube, float(gradients), seconds=seconds)
 
-    fixed = ControllerConfig() if levels is None else ControllerConfig(levels=levels, runs=runs)
-    amount = {"levels": list(fixed.levels), "runs": fixed.runs}
-    if levels is None:
-        amount |= {"unexplained": fixed.unexplained, "tolerance": fixed.tolerance}
+    ours = ControllerConfig()
+    amount: dict[str, Any] = {"particles": particles}
+    if particles is None:
+        amount = {"particles": ours.particles, "unexplained": ours.unexplained, "tolerance": ours.tolerance}
     settings = {"stages": stages, "budget_s": budget_s, **amount, **(infer or {}), **(smc or {})}
     programs = "" if budget_s is None else group  # one budget compiles what another needs
     return Method(name, group, label, sample, settings, conditions, programs, smc=True)
@@ -236,9 +235,8 @@ METHODS = (
     _hmc("paper", "paper", annealed(100, 100), TELLING),
     _hmc("fixed", "fixed temperature", replace(annealed(20, 100), s_start=0.1), TELLING),
     _estimate("smc", "smc", "x1", stages=60),
-    _estimate("smc, 2 runs", "smc", "x2", stages=120, runs=2, conditions=TELLING),
-    _estimate("smc, smallest level", "smallest level", "x1", stages=60, levels=(3,)),
-    _estimate("smc, smallest level, 4 runs", "smallest level", "x4", stages=240, levels=(3,), runs=4),
+    _estimate("smc, 3 runs", "smc", "x3", stages=180, particles=192, conditions=TELLING),
+    _estimate("smc, 6 runs", "smc", "x6", stages=360, particles=384, conditions=TELLING),
     _estimate(
         "smc, from the prior",
         "lever off",
@@ -262,7 +260,7 @@ METHODS = (
         conditions=TELLING,
     ),
     *(
-        _estimate(f"controller {s:g} s", "controller", f"{s:g} s", budget_s=s, levels=None)
+        _estimate(f"controller {s:g} s", "controller", f"{s:g} s", budget_s=s, particles=None)
         for s in (1.0, 3.0, 10.0, 30.0)
     ),
 )

@@ -1,7 +1,8 @@
 """Answers to one view: the posterior, and what it must beat: prior alone, encoder alone, one MAP shape."""
 
 import time
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection
+from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
@@ -44,11 +45,14 @@ def answers(
     seed: int,
     budget_s: float | None,
     stages: int | None,
+    methods: Collection[str] = METHODS,
 ) -> dict[str, Answer]:
-    """All four methods' answers to the same observation."""
-    found = estimate(vessel.frame, vessel.segment, prior, config, seed=seed, budget_s=budget_s, stages=stages)
-    h = found.hypotheses
-    result = {POSTERIOR: Answer(coarsen(h.solid, GRID), h.weights, found.seconds, h.result)}
+    """The methods' answers to the same observation."""
+    result: dict[str, Answer] = {}
+    if POSTERIOR in methods:
+        found = estimate(vessel.frame, vessel.segment, prior, config, seed=seed, budget_s=budget_s, stages=stages)
+        h = found.hypotheses
+        result[POSTERIOR] = Answer(coarsen(h.solid, GRID), h.weights, found.seconds, h.result)
     observation, cube = observe(vessel.frame, vessel.segment, config.observe, seed)
     picture = crop(vessel.frame, vessel.segment, cube, prior.model.preset.image_size)
     likelihood = likelihood_of(config.infer, observation)
@@ -61,16 +65,18 @@ def answers(
         shapes = coarsen(solid(np.asarray(opacity)), GRID)
         return Answer(shapes, weights, time.monotonic() - begun)
 
-    begun = time.monotonic()
-    count = len(h.weights)
-    result[PRIOR] = answer(jax.random.normal(key, (count, dim)), np.full(count, 1.0 / count), begun)
-    begun = time.monotonic()
-    drawn, weights = encoder_alone(key, model, likelihood, observation, picture, rivals)
-    result[ENCODER] = answer(drawn, weights, begun)
-    begun = time.monotonic()
-    starts = encoder_positions(key, model, picture, even_yaws(rivals.yaws), 1, 0.0)
-    best, _ = map_estimate(model, likelihood, observation, starts, rivals.fit)
-    result[MAP] = answer(best[None], np.ones(1), begun)
+    if PRIOR in methods:
+        begun, count = time.monotonic(), config.hypotheses
+        result[PRIOR] = answer(jax.random.normal(key, (count, dim)), np.full(count, 1.0 / count), begun)
+    if ENCODER in methods:
+        begun = time.monotonic()
+        drawn, weights = encoder_alone(key, model, likelihood, observation, picture, rivals)
+        result[ENCODER] = answer(drawn, weights, begun)
+    if MAP in methods:
+        begun = time.monotonic()
+        starts = encoder_positions(key, model, picture, even_yaws(rivals.yaws), 1, 0.0)
+        best, _ = map_estimate(model, likelihood, observation, starts, rivals.fit)
+        result[MAP] = answer(best[None], np.ones(1), begun)
     return result
 
 
@@ -82,8 +88,7 @@ def warm_up(
     likelihood = likelihood_of(config.infer, observation)
     size = (likelihood.lattice.crossings, *likelihood.packed)
     if size not in sizes:
-        for level in config.levels:
-            estimate(frame, segment, prior, replace(config, levels=(level,)), stages=1)
+        estimate(frame, segment, prior, config, stages=1)
         sizes.add(size)
 
 

@@ -69,7 +69,7 @@ def _prior() -> Model:
 
 
 THOROUGH = TemperedSMCConfig(populations=2, particles=96, start_particles=768, moves=4, final_stages=2, keep=2)
-QUICK = replace(InferConfig().smc, evidence_power=1.0)  # what ships, but for its starts, runs and weights
+QUICK = replace(InferConfig().smc_from_prior, evidence_power=1.0)  # what ships, but for its starts, runs and weights
 CONDITIONS = (
     Condition("cylinder", CylinderModel, TemperedSMCConfig(), columns=6, rows=5, lattice=12),
     Condition("shipped prior, pose known", _prior, THOROUGH, pose=False),

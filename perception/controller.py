@@ -1,13 +1,12 @@
 """How much model a scene needs: from a frame's segment to published hypotheses, with no more than that.
 
-A level is an amount of model: particles divided by a number. The controller begins with the least, and has an answer
-to publish after every stage. Where the shapes of a level leave too many pixels unexplained (a posterior-predictive
-check) or the Monte Carlo error of the answer is above the tolerance, the next level begins, afresh: what a small
-population has dropped a larger one could not find again. At the last level further independent populations may join.
-By default there is one level: no check of the answer told where a third of its particles was too few (that third is
-"smallest level" in `farside bench frontier`; `controller.levels: [3, 1]` begins with it).
+A run is a small sampler: a few independent populations of a few particles, which begin where climbs from the encoder's
+guesses end. Its populations tell the Monte Carlo error of what it says of unseen space. Where that is above the
+tolerance the controller makes as many further runs as should bring it down (it falls with their root), and their
+populations answer together; where the shapes leave too many pixels unexplained (a posterior-predictive check) it makes
+all it may. There is an answer to publish from the start, and a better one after each step.
 
-Lattice and rays are the same at every level: with half of both, shapes were worse on easy scenes as on hard ones, and
+Lattice and rays are the same for every scene: with half of both, shapes were worse on easy scenes as on hard ones, and
 no check told where (`farside bench frontier` has a coarse lattice among its levers).
 """
 
@@ -29,12 +28,22 @@ from perception.segment import Segment
 from perception.source import Frame
 from probnerf.families.render import look_at, pinhole_rays
 from probnerf.hmc import StageInfo
-from probnerf.infer import InferConfig, asks_encoder, crossings_of, encoder_guess, infer, likelihood_of, modes_of
+from probnerf.infer import (
+    InferConfig,
+    asks_encoder,
+    crossings_of,
+    encoder_guess,
+    infer,
+    likelihood_of,
+    modes_of,
+    sampler_of,
+)
 from probnerf.mixture import GaussianMixture
 from probnerf.model import Likelihood
 from probnerf.populations import pooled
 from probnerf.prior import ProbNeRF
 from probnerf.proposal import Picture
+from probnerf.smc import TemperedSMCConfig
 from probnerf.store import Prior
 from probnerf.types import OBJECT, UNKNOWN, Observation, Posterior
 from probnerf.views import ENCODER_RADIUS
@@ -44,22 +53,28 @@ from probnerf.views import ENCODER_RADIUS
 class ControllerConfig(PublishConfig):
     """What is inferred at most, when less is enough, and how finely it is published."""
 
-    infer: InferConfig = field(default_factory=InferConfig)  # of the largest level
+    infer: InferConfig = field(default_factory=InferConfig)  # of one run
     observe: ObserveConfig = field(default_factory=ObserveConfig)
     first_hypotheses: int = 8  # published while better ones are under way
-    levels: tuple[int, ...] = (1,)  # particles of each are the largest level's divided by this
-    unexplained: float = 0.1  # share of pixels at which a level is too small
-    tolerance: float = 0.025  # Monte Carlo error of the mean unseen occupancy that is good enough
-    runs: int = 2  # at the last level, at most, each with populations of its own
+    unexplained: float = 0.1  # share of pixels above which all runs are made
+    tolerance: float = 0.006  # Monte Carlo error of the mean unseen occupancy that is good enough
+    particles: int = 384  # of all runs together, at most; one run is always made
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        falling = all(a > b for a, b in zip(self.levels, self.levels[1:], strict=False))
-        if min(self.first_hypotheses, self.runs, *self.levels, len(self.levels)) < 1 or not falling:
+        if min(self.first_hypotheses, self.particles) < 1:
             raise ValueError(
-                f"first_hypotheses {self.first_hypotheses} and runs {self.runs} must be 1 or more, and levels"
-                f" {self.levels} must fall, the least amount of model first"
+                f"first_hypotheses {self.first_hypotheses} and particles {self.particles} must be 1 or more"
             )
+
+    def needed(self, done: int, error: float, missed: float, most: int) -> int:
+        """How many runs the answer takes, if `done` of them leave this Monte Carlo error and share of pixels missed."""
+        if missed > self.unexplained:
+            return most
+        if error <= self.tolerance:
+            return done
+        wanted = done * (error / self.tolerance) ** 2 if self.tolerance > 0 and np.isfinite(error) else np.inf
+        return int(min(most, max(done + 1, np.ceil(min(wanted, most)))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +87,7 @@ class Estimate:
     observation: Observation
     object_frame: ObjectFrame
     seconds: float
-    log: tuple[str, ...] = ()  # why the model grew, and why it stopped, a line a level
+    log: tuple[str, ...] = ()  # why there were more runs, and why no more, a line an answer
 
 
 def estimate(
@@ -122,55 +137,57 @@ def infer_view(
     on_stage: Callable[[StageInfo], bool | None] | None = None,
     on_answer: Callable[[Hypotheses], None] | None = None,
 ) -> Estimate:
-    """Sample the posterior of a view and publish it, with as much model as it takes.
+    """Sample the posterior of a view and publish it, in as many runs as it takes.
 
-    `before` is a posterior of the same view that was cut short; only the largest level goes on from it. `fresh`:
-    nothing is known of the object, so that the encoder's guess is worth handing out at once. `stages` and `deadline`
-    are for all levels together. A level that is cut short leaves the last whole answer standing.
+    `before` is a posterior of the same view that was cut short; one run goes on from it. `fresh`: nothing is known of
+    the object, so that the encoder's guess is worth handing out at once. `stages` and `deadline` are for all runs
+    together. A further run that is cut short is left out.
     """
     begun = time.monotonic()
     work = _Work(view, prior, config, seed, before, fresh, deadline, stages, on_stage, on_answer)
     grows = before is None and config.infer.method == "tempered_smc"
-    last = config.levels[-1] if grows else 1
-    plan = [(level, 0) for level in config.levels[:-1] if grows] + [
-        (last, run) for run in range(config.runs if grows else 1)
-    ]
-    runs: list[Posterior] = []  # of one level, all whole
+    runs: list[Posterior] = []  # whole ones, but for a first
     log: list[str] = []
-    while plan:
-        (level, run), *plan = plan
-        posterior = work.sample(level, run)
+    needed, answered = 1, 0
+    short: str | None = None
+    while short is None and len(runs) < needed:
+        posterior = work.sample(len(runs))
         whole = posterior.result == "converged"
-        if not whole and runs:
-            log.append(f"{work.amount(level, run)}: cut short ({posterior.result}), the answer before it stands")
-            runs[-1], work.answer = work.ended(runs[-1], posterior.result)
-            break
-        runs = [posterior] if run == 0 else [*runs, posterior]
-        together = pooled(runs, config.infer.smc.evidence_power)
-        h = work.answer = work.publish(together, config.hypotheses)
-        missed = 1.0 - h.diagnostics["explained"]
-        if not whole or (missed <= config.unexplained and h.monte_carlo_error <= config.tolerance):
-            plan = []
-        grown = f" -> {work.amount(*plan[0])}" if plan else ""
-        why = f"error {h.monte_carlo_error:.3f}, {100 * missed:.0f}% of pixels not explained"
-        log.append(f"{work.amount(level, run)}{grown}: {why}")
-        if plan and (short := work.short_of(level, *plan[0])) is not None:
-            log.append(f"{work.amount(*plan[0])}: no room left ({short})")
-            runs[-1], work.answer = work.ended(runs[-1], short)
-            break
-        if plan and on_answer is not None:
-            on_answer(replace(h, result="underway"))
+        if whole or not runs:
+            runs.append(posterior)
+        if not whole:
+            short = posterior.result
+        elif len(runs) < needed:
+            short = work.short_of()
+        if short is None and len(runs) < needed:
+            continue
+        if len(runs) > answered:
+            h = work.answer = work.publish(pooled(runs, work.smc.evidence_power), config.hypotheses)
+            answered, missed = len(runs), 1.0 - h.diagnostics["explained"]
+            log.append(
+                f"{work.amount(answered)}: error {h.monte_carlo_error:.3f}, {100 * missed:.0f}% of pixels not explained"
+            )
+            if grows and short is None:
+                needed = config.needed(answered, h.monte_carlo_error, missed, work.most)
+            if short is None and needed > answered:
+                log[-1] += f" -> {work.amount(needed)}"
+                short = work.short_of()
+                if short is None and on_answer is not None:
+                    on_answer(replace(h, result="underway"))
+        if short is not None and len(runs) < needed:
+            log.append(f"no room for more ({short})")
+            work.answer, runs[-1] = replace(h, result=short, stage=work.stages), replace(runs[-1], result=short)
     assert work.answer is not None
     if on_answer is not None:
         on_answer(work.answer)
-    found = pooled(runs, config.infer.smc.evidence_power)
+    found = pooled(runs, work.smc.evidence_power)
     seconds = time.monotonic() - begun
     return Estimate(work.answer, found, work.likelihood, view.observation, view.object_frame, seconds, tuple(log))
 
 
 @dataclass(eq=False)
 class _Work:
-    """One view's sampling: what all levels share, and what they have cost."""
+    """One view's sampling: what all runs share, and what they have cost."""
 
     view: View
     prior: Prior
@@ -186,7 +203,7 @@ class _Work:
     reference: GaussianMixture | None = None  # where all runs begin, if not at the prior
     stages: int = 0  # done
     point_gradients: float = 0.0
-    answer: Hypotheses | None = None  # of a whole level
+    answer: Hypotheses | None = None  # of whole runs
     answered: float = field(default_factory=time.monotonic)  # when the last one that was underway was given,
     answering: float = 0.0  # s; and what it took
     stage_s: list[float] = field(default_factory=list)  # s; each stage of the latest run
@@ -194,8 +211,17 @@ class _Work:
 
     @cached_property
     def likelihood(self) -> Likelihood:
-        """Of the largest level."""
         return likelihood_of(self.config.infer, self.view.observation)
+
+    @property
+    def smc(self) -> TemperedSMCConfig:
+        """Of one run."""
+        return sampler_of(self.config.infer, self.reference, self.before)
+
+    @property
+    def most(self) -> int:
+        """Runs."""
+        return max(1, self.config.particles // (self.smc.populations * self.smc.particles))
 
     @cached_property
     def picture(self) -> Picture | None:
@@ -204,18 +230,18 @@ class _Work:
             return None
         return crop(self.view.frame, self.view.segment, self.view.object_frame, self.prior.model.preset.image_size)
 
-    def sample(self, level: int, run: int) -> Posterior:
-        """One run of `infer` at a level."""
+    def sample(self, run: int) -> Posterior:
+        """One run of `infer`."""
         observation = self.view.observation
         key = jax.random.key(self.seed)
         if not self.searched and self.before is None:
             self._search(jax.random.fold_in(key, 1))
         self.stage_s, self.since = [], time.monotonic()
         posterior, likelihood = infer(
-            jax.random.fold_in(key, 10 * level + run) if self.stages else key,
+            jax.random.fold_in(key, 10 + run) if run else key,
             self.prior.model,
             observation,
-            _lesser(self.config.infer, level),
+            self.config.infer,
             reference=self.reference,
             before=self.before,
             on_stage=self._told,
@@ -244,7 +270,7 @@ class _Work:
         now = time.monotonic()
         self.stage_s.append(now - self.since)
         # without an encoder's guess the first answer at once; a later one when the time it takes is a fifth of what
-        # went by; none that is underway once a level is whole
+        # went by; none that is underway once a run is whole
         if self.on_answer is not None and self.answer is None and now - self.answered >= 4.0 * self.answering:
             self._answer(info.samples())
         self.since = time.monotonic()
@@ -260,33 +286,23 @@ class _Work:
 
     def publish(self, posterior: Posterior, count: int) -> Hypotheses:
         """The samples at hand as planners read them."""
-        more = {"point_gradients": self.point_gradients, "evidence_power": self.config.infer.smc.evidence_power}
+        more = {"point_gradients": self.point_gradients, "evidence_power": self.smc.evidence_power}
         config = replace(self.config, hypotheses=count)
         h = published(self.view, posterior, self.likelihood, self.prior, config, self.seed, more)
         return replace(h, stage=max(self.stages, h.stage))
 
-    def ended(self, posterior: Posterior, result: str) -> tuple[Posterior, Hypotheses]:
-        """The last whole answer, with why there was none after it."""
-        assert self.answer is not None
-        return replace(posterior, result=result), replace(self.answer, result=result, stage=self.stages)
-
-    def short_of(self, level: int, next_level: int, run: int) -> str | None:
-        """Which limit leaves no room for a next run, if one does: the time is that of the run before, in proportion."""
+    def short_of(self) -> str | None:
+        """Which limit leaves no room for a next run, if one does: it takes the time of the run before, at least."""
         if self.cap is not None and self.stages >= self.cap:
             return "stages"
-        expected = len(self.stage_s) * min(self.stage_s) * level / next_level  # at least
+        expected = len(self.stage_s) * min(self.stage_s)
         if self.deadline is not None and time.monotonic() + expected > self.deadline:
             return "budget"
         return None
 
-    def amount(self, level: int, run: int) -> str:
-        """A level in words."""
-        smc = _lesser(self.config.infer, level).smc
-        return f"{(run + 1) * smc.populations} x {smc.particles} particles"
-
-
-def _lesser(config: InferConfig, level: int) -> InferConfig:
-    return replace(config, smc=replace(config.smc, particles=max(2, config.smc.particles // level)))
+    def amount(self, runs: int) -> str:
+        """The particles of so many runs, in words."""
+        return f"{runs * self.smc.populations} x {self.smc.particles} particles"
 
 
 def crop(frame: Frame, segment: Segment, cube: ObjectFrame, size: int) -> Picture:

@@ -10,23 +10,20 @@ from perception.track import Tracker
 
 
 def warm_up(tracker: Tracker) -> None:
-    """Look at an object of the shipped recording at every level, with a tracker of the same prior and configuration.
+    """Look at an object of the shipped recording with a tracker of the same prior and configuration.
 
     Raises KeyboardInterrupt where Ctrl-C ended it, which the sampler may keep for itself.
 
     A full garbage collection stops every thread. Over what JAX keeps of its programs it takes 0.1 to 0.3 s, several
     periods of a camera, so what is there by then is set aside from it.
     """
-    levels = tracker.config.levels
     frame = next(iter(Log(SHIPPED_LOG)))
+    trial = replace(tracker, _tracks={}, _names=set())
     try:
-        for level in levels:
-            config = replace(tracker.config, levels=(level,))
-            trial = replace(tracker, config=config, _tracks={}, _names=set())
-            for _ in range(1 + (level == levels[-1])):  # an answer that was cut short is gone on with
-                update = trial.update(frame, segment(frame)[0], stages=1, on_answer=lambda _: None)
-                if update.hypotheses.result == "interrupted":
-                    raise KeyboardInterrupt
+        for _ in range(2):  # an answer that was cut short is gone on with
+            update = trial.update(frame, segment(frame)[0], stages=1, on_answer=lambda _: None)
+            if update.hypotheses.result == "interrupted":
+                raise KeyboardInterrupt
     except ValueError:  # a prior of other objects: its own first frame compiles
         pass
     gc.collect()

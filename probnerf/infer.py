@@ -37,20 +37,23 @@ _NOWHERE = 50.0  # cube units, outside every window: the kernel passes such poin
 WALL_ERROR = 0.02  # cube units; how well the prior's shapes place a wall
 
 
-def quick_smc() -> TemperedSMCConfig:
-    """A population that two CPU cores move in seconds; `TemperedSMCConfig()` is the one that the laws are tested on."""
-    # many particles and one short move: few particles all descend from one or two starts, and lose the other modes
+def quick_smc(populations: int, particles: int) -> TemperedSMCConfig:
+    """What two CPU cores move in seconds; `TemperedSMCConfig()` is the one that the laws are tested on.
+
+    Populations count alike: what decides between modes, a few nats, is less than the likelihood's own error and the
+    error of the evidence's estimates.
+    """
     return TemperedSMCConfig(
-        populations=4,
-        particles=48,
-        start_particles=384,
+        populations=populations,
+        particles=particles,
+        start_particles=8 * particles,
         moves=1,
         leapfrog_steps=3,
         ess_target=0.4,
         target_acceptance=0.65,
         final_stages=1,
         keep=1,
-        evidence_power=0.5,
+        evidence_power=0.0,
         least_moved=1.0,
     )
 
@@ -60,8 +63,11 @@ class InferConfig:
     """Which sampler, how much of it, and the pixel likelihood's numbers."""
 
     method: Method = "tempered_smc"
-    smc: TemperedSMCConfig = field(default_factory=quick_smc)
     modes: ModesConfig = field(default_factory=ModesConfig)  # where tempered_smc begins
+    # From modes each of many small populations follows one or two to the end. From the prior few particles all descend
+    # from one or two starts, and lose the other modes.
+    smc: TemperedSMCConfig = field(default_factory=lambda: quick_smc(8, 8))
+    smc_from_prior: TemperedSMCConfig = field(default_factory=lambda: quick_smc(4, 48))
     hmc: AnnealedHMCConfig = field(default_factory=AnnealedHMCConfig)
     lattice: int = 32  # G: cubes per 2 units
     extent: float = 1.1  # the lattice covers [-extent, extent]^3: an object may be larger than its guessed cube
@@ -162,6 +168,16 @@ def modes_of(
     return mixture_of_modes(args, starts, config.modes)
 
 
+def sampler_of(
+    config: InferConfig, reference: GaussianMixture | None, before: Posterior | None = None
+) -> TemperedSMCConfig:
+    """The populations for where tempering begins; what goes on from `before` keeps to those that made it."""
+    if before is None:
+        return config.smc_from_prior if reference is None else config.smc
+    made = len(before.diagnostics.beta)
+    return config.smc if made % config.smc.populations == 0 else config.smc_from_prior
+
+
 def infer(
     key: Array,
     model: Model,
@@ -190,9 +206,10 @@ def infer(
             config.hmc if stages is None else replace(config.hmc, iterations=stages, keep=min(config.hmc.keep, stages))
         )
         return annealed_hmc(key, log_likelihood, args, dim, hmc, on_stage=on_stage, deadline=deadline), likelihood
-    initial = None if before is None else start_from(before, config.smc.populations)
+    smc = sampler_of(config, reference, before)
+    initial = None if before is None else start_from(before, smc.populations)
     posterior = tempered_smc(
-        key, log_likelihood, args, dim, config.smc, initial=initial, reference=reference if before is None else None,
+        key, log_likelihood, args, dim, smc, initial=initial, reference=reference if before is None else None,
         on_stage=on_stage, deadline=deadline, stages=stages,
     )  # fmt: skip
     return posterior, likelihood

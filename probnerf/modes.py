@@ -31,7 +31,8 @@ class ModesConfig:
     """How many starts climb how far, and what is laid about where they end."""
 
     starts: int = 24  # at even yaws (where the pose is known: draws)
-    climb: AdamConfig = field(default_factory=lambda: AdamConfig(steps=100))
+    screen: AdamConfig = field(default_factory=lambda: AdamConfig(steps=30, final_learning_rate=0.05))  # of all starts
+    climb: AdamConfig = field(default_factory=lambda: AdamConfig(steps=30))  # of the better one of each two neighbours
     difference: float = 0.03  # of positions, for second derivatives
     widen: float = 2.0  # factor on the likelihood's variances: weights of a reference that is too narrow run away
     power: float = 0.5  # a Gaussian's share is its mode's evidence (Laplace) to this power
@@ -40,14 +41,15 @@ class ModesConfig:
 
     def gradients(self, dim: int) -> float:
         """Gradients of whole positions of `dim` numbers that climbs and second derivatives take."""
-        return float(self.starts * (self.climb.steps + 2 * dim))
+        return float(self.starts * self.screen.steps + self.starts // 2 * (self.climb.steps + 1 + dim))
 
     def __post_init__(self) -> None:
         good = min(self.difference, self.widen, self.prior_share) > 0 and self.prior_share < 1
-        if self.starts < 1 or not (good and 0 <= self.power <= 1):
+        if self.starts < 2 or self.starts % 2 or not (good and 0 <= self.power <= 1):
             raise ValueError(
-                f"starts {self.starts} must be 1 or more, difference {self.difference:g} and widen {self.widen:g} more"
-                f" than 0, power {self.power:g} from 0 to 1, prior_share {self.prior_share:g} between 0 and 1"
+                f"starts {self.starts} must be even and 2 or more, difference {self.difference:g} and widen"
+                f" {self.widen:g} more than 0, power {self.power:g} from 0 to 1, prior_share {self.prior_share:g}"
+                " between 0 and 1"
             )
 
 
@@ -68,11 +70,16 @@ def log_posterior(args: tuple, _: None, positions: Float[Array, "p d"]) -> Float
 def mixture_of_modes(args: Args, starts: Float[Array, "k d"], config: ModesConfig) -> GaussianMixture:
     """Gaussians about the modes that the starts climb to, and the prior.
 
-    About a mode the precision is that of the prior plus the likelihood's (its Hessian by central differences of the
-    gradient, rising directions left out) over `widen`. Starts that end in one mode are as many Gaussians there.
+    Of each two neighbouring starts only the better one climbs all the way. About a mode the precision is that of the
+    prior plus the likelihood's (its Hessian by differences of the gradient, rising directions left out) over `widen`.
+    Climbs that end in one mode are as many Gaussians there.
     """
     model, likelihood = args[:2]
-    top, _ = ascend(log_posterior, args, starts, config.climb)
+    top, _ = ascend(log_posterior, args, starts, config.screen)
+    # neighbours in yaw, not the best of all: modes that are far apart must not compete before they are climbed
+    value = log_posterior(args, None, top).reshape(-1, 2)
+    top = top.reshape(len(value), 2, -1)[jnp.arange(len(value)), jnp.argmax(value, axis=1)]
+    top, _ = ascend(log_posterior, args, top, config.climb)
     dim = top.shape[1]
     toward = jnp.zeros_like(top)
     if likelihood.sample_pose:  # only the angle of (a, b) climbs: put their length where the posterior has it
@@ -97,10 +104,9 @@ def mixture_of_modes(args: Args, starts: Float[Array, "k d"], config: ModesConfi
 
 def _stiffness(args: Args, q: Float[Array, "k d"], step: float) -> tuple[Float[Array, "k d"], Float[Array, "k d d"]]:
     """Eigenvalues (0 or more) and eigenvectors (columns) of the log-likelihood's negative Hessian at each position."""
-    offsets = step * jnp.concatenate([jnp.eye(q.shape[1]), -jnp.eye(q.shape[1])])
     slope = jax.grad(lambda x: jnp.sum(log_likelihood(args, x)))
     # an offset at a time, so that it takes no more memory than the climb
-    up, down = jnp.split(jax.lax.map(lambda offset: slope(q + offset), offsets), 2)  # [d, k, d]
-    hessian = jnp.nan_to_num(down - up, posinf=0.0, neginf=0.0).swapaxes(0, 1) / (2.0 * step)
+    here, there = slope(q), jax.lax.map(lambda offset: slope(q + offset), step * jnp.eye(q.shape[1]))  # [d, k, d]
+    hessian = jnp.nan_to_num(here - there, posinf=0.0, neginf=0.0).swapaxes(0, 1) / step
     along, axes = jnp.linalg.eigh(0.5 * (hessian + hessian.swapaxes(1, 2)))
     return jnp.clip(along, 0.0, 1e6), axes

@@ -103,8 +103,7 @@ CAMERA = Camera(320, 240, np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0,
 FEW = ControllerConfig(
     grid=32,
     hypotheses=32,
-    levels=(1,),
-    infer=InferConfig(lattice=12, smc=replace(quick_smc(), particles=24, start_particles=96, leapfrog_steps=2)),
+    infer=InferConfig(lattice=12, smc_from_prior=replace(quick_smc(4, 24), start_particles=96, leapfrog_steps=2)),
 )
 
 
@@ -132,8 +131,8 @@ def test_estimate_runs_without_depth() -> None:
     _, frame = on_a_table(VALIDATION_SEEDS[3])
     blind_frame = replace(frame, depth=None)
     prior = Prior(ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {}, "")
-    smc = replace(quick_smc(), populations=2, particles=4, start_particles=8, moves=1, leapfrog_steps=1)
-    config = ControllerConfig(hypotheses=4, grid=16, infer=InferConfig(lattice=8, smc=smc))
+    smc = replace(quick_smc(2, 4), start_particles=8, leapfrog_steps=1)
+    config = ControllerConfig(hypotheses=4, grid=16, infer=InferConfig(lattice=8, smc_from_prior=smc))
     stages: list[StageInfo] = []
     (found,) = segment(blind_frame, 1)
     first = estimate(blind_frame, found, prior, config, stages=2, on_stage=stages.append)

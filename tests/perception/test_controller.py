@@ -14,12 +14,12 @@ from probnerf.store import load_prior
 from tests.perception.test_track import frame_from
 
 CONFIG = ControllerConfig(
-    # no climbs, which cost every level the same
-    infer=InferConfig(smc=replace(quick_smc(), populations=2, particles=32, start_particles=128), encoder_starts=False),
+    # no climbs, which cost the same however many runs
+    infer=InferConfig(smc_from_prior=replace(quick_smc(2, 10), start_particles=40), encoder_starts=False),
     hypotheses=8,
     first_hypotheses=4,
     grid=32,
-    levels=(3, 1),
+    particles=80,
 )
 
 
@@ -32,7 +32,7 @@ def answers_of(config: ControllerConfig, stages: int | None = None) -> tuple[Est
 
 
 @pytest.mark.slow
-def test_where_little_is_asked_the_least_level_is_all() -> None:
+def test_where_little_is_asked_one_run_is_all() -> None:
     found, told = answers_of(replace(CONFIG, unexplained=1.0, tolerance=inf))
     assert len(found.log) == 1 and found.log[0].startswith("2 x 10 particles: error")
     assert found.hypotheses is told[-1] and found.hypotheses.result == "converged"
@@ -42,29 +42,29 @@ def test_where_little_is_asked_the_least_level_is_all() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("limits", [{"unexplained": 0.0, "tolerance": inf}, {"unexplained": 1.0, "tolerance": 0.0}])
-def test_unexplained_pixels_make_it_grow_and_so_does_error(limits: dict[str, float]) -> None:
+def test_unexplained_pixels_take_all_runs_and_so_does_error(limits: dict[str, float]) -> None:
     small, _ = answers_of(replace(CONFIG, unexplained=1.0, tolerance=inf))
     found, told = answers_of(replace(CONFIG, **limits))
-    assert ["->" in line for line in found.log] == [True, True, False]
-    assert "2 x 10 particles -> 2 x 32 particles: error" in found.log[0]
-    assert "2 x 32 particles -> 4 x 32 particles: error" in found.log[1]
+    assert [line.split(": error")[0] for line in found.log] == ["2 x 10 particles", "8 x 10 particles"]
+    assert found.log[0].endswith("-> 8 x 10 particles") and "->" not in found.log[1]
     h = found.hypotheses
-    assert h.result == "converged" and len(np.unique(h.population)) == 4
-    assert h.diagnostics["point_gradients"] > 5 * small.hypotheses.diagnostics["point_gradients"]
+    assert h.result == "converged" and len(np.unique(h.population)) == 8
+    assert found.posterior.positions.shape[0] == 80
+    assert h.diagnostics["point_gradients"] > 2.5 * small.hypotheses.diagnostics["point_gradients"]
     assert float(np.exp(np.asarray(found.posterior.log_weights, np.float64)).sum()) == pytest.approx(1.0, abs=1e-4)
-    # the least level's answer came in full, and after it none that was underway
+    # the first run's answer came in full, and after it none that was underway but whole ones
     full = [len(t.weights) == CONFIG.hypotheses for t in told]
-    assert full[full.index(True) :] == [True] * 3
+    assert full[full.index(True) :] == [True] * 2
 
 
 @pytest.mark.slow
-def test_a_cut_leaves_the_answer_before_it_and_repeats_bit_for_bit() -> None:
+def test_a_cut_leaves_the_runs_before_it_and_repeats_bit_for_bit() -> None:
     config = replace(CONFIG, tolerance=0.0)
     small, _ = answers_of(replace(CONFIG, unexplained=1.0, tolerance=inf))
     stages = small.hypotheses.stage + 2
     found, _ = answers_of(config, stages)
     assert found.hypotheses.result == found.posterior.result == "stages" and found.hypotheses.stage == stages
-    assert "cut short (stages)" in found.log[-1]
+    assert found.log[-1] == "no room for more (stages)"
     np.testing.assert_array_equal(found.hypotheses.opacity, small.hypotheses.opacity)
     again, _ = answers_of(config, stages)
     np.testing.assert_array_equal(again.hypotheses.opacity, found.hypotheses.opacity)
@@ -72,7 +72,32 @@ def test_a_cut_leaves_the_answer_before_it_and_repeats_bit_for_bit() -> None:
     assert exact.hypotheses.result == "stages" and exact.hypotheses.stage == small.hypotheses.stage
 
 
-def test_levels_that_do_not_fall_are_refused() -> None:
-    for levels in ((1, 2), (2, 2), (), (0,)):
-        with pytest.raises(ValueError, match="levels"):
-            ControllerConfig(levels=levels)
+@pytest.mark.slow
+def test_a_cut_between_later_runs_keeps_all_that_are_whole() -> None:
+    config = replace(CONFIG, tolerance=0.0)
+    each = [answers_of(replace(config, particles=20 * runs))[0].hypotheses.stage for runs in (2, 3)]
+    found, _ = answers_of(config, (each[0] + each[1]) // 2)
+    assert found.hypotheses.result == "stages" and found.posterior.positions.shape[0] == 40
+    assert len(np.unique(found.hypotheses.population)) == 4
+    assert found.log[1].startswith("4 x 10 particles: error") and found.log[2] == "no room for more (stages)"
+
+
+@pytest.mark.parametrize(
+    ("done", "error", "missed", "needed"),
+    [
+        (1, 0.009, 0.0, 1),  # good enough
+        (1, 0.019, 0.0, 4),  # (1.9)^2 rounded up
+        (4, 0.0101, 0.0, 5),
+        (1, 0.5, 0.0, 6),  # all there may be
+        (1, 0.009, 0.2, 6),
+        (6, 0.5, 0.2, 6),
+        (1, float("nan"), 0.0, 6),
+    ],
+)
+def test_how_many_runs_an_error_takes(done: int, error: float, missed: float, needed: int) -> None:
+    assert ControllerConfig(tolerance=0.01, unexplained=0.1).needed(done, error, missed, 6) == needed
+
+
+def test_no_particles_are_refused() -> None:
+    with pytest.raises(ValueError, match="particles 0"):
+        ControllerConfig(particles=0)

@@ -14,11 +14,10 @@ from perception.simulate import Placed, Scene, place_camera, simulate
 from perception.source import Frame
 from perception.track import TrackConfig, Tracker, _Kept, _same_plane, _with_view
 from probnerf.families.tabletop import part_distances
-from probnerf.infer import InferConfig, quick_smc
 from probnerf.store import load_prior
 from tests.node.mugs import CAMERA, MUG
 
-QUICK = ControllerConfig(infer=InferConfig(smc=replace(quick_smc(), populations=2)), hypotheses=32, levels=(1,), runs=1)
+QUICK = ControllerConfig(hypotheses=32, particles=1)
 
 
 def frame_from(azimuth: float, mug: Placed = MUG, stamp_ns: int = 0, seed: int = 0) -> Frame:

@@ -77,12 +77,23 @@ def test_the_stiffness_is_the_hessian_s_without_its_rising_directions():
     slope = jax.jit(jax.vmap(jax.grad(lambda x: log_likelihood_one(*args, x))))
     offsets = 1e-2 * np.eye(9, dtype=np.float32)
     for k in range(2):
-        up, down = slope(q[k] + offsets), slope(q[k] - offsets)
-        hessian = np.asarray(down - up, np.float64) / 2e-2
+        hessian = np.asarray(slope(q[k][None]) - slope(q[k] + offsets), np.float64) / 1e-2
         expected = np.clip(np.linalg.eigvalsh(0.5 * (hessian + hessian.T)), 0.0, None)
         np.testing.assert_allclose(along[k], expected, rtol=1e-2, atol=1e-3 * expected.max())
         np.testing.assert_allclose(axes[k].T @ axes[k], np.eye(9), atol=1e-5)
     assert float(along.max()) > 100.0 and float(along.min()) == 0.0
+
+
+def test_of_two_neighbours_the_better_one_climbs_on() -> None:
+    args = scene("seen", True)
+    still = AdamConfig(steps=1, learning_rate=1e-9, final_learning_rate=1e-9)
+    starts = _starts(8)
+    mixture = mixture_of_modes(args, starts, ModesConfig(starts=8, screen=still, climb=still))
+    value = np.asarray(jax.jit(log_posterior)(args, None, starts)).reshape(4, 2)
+    expected = np.asarray(starts).reshape(4, 2, 9)[np.arange(4), value.argmax(axis=1)]
+    yaw = [np.arctan2(q[:, 3], q[:, 2]) for q in (np.asarray(mixture.mean[:-1]), expected)]
+    assert np.ptp(value, axis=1).min() > 0.1  # not a matter of rounding
+    np.testing.assert_allclose(yaw[0], yaw[1], atol=1e-5)
 
 
 def test_gaussians_stand_on_modes_as_wide_as_the_posterior_and_the_prior_is_among_them():
@@ -105,7 +116,7 @@ def test_gaussians_stand_on_modes_as_wide_as_the_posterior_and_the_prior_is_amon
     covariance = np.linalg.inv(np.asarray(mixture.root[best] @ mixture.root[best].T, np.float64))
     across = np.array([-mean[3], mean[2]]) / (mean[2] ** 2 + mean[3] ** 2)  # of yaw by (a, b)
     laplace = np.sqrt(across @ covariance[2:4, 2:4] @ across)
-    assert 0.5 * spread < laplace / np.sqrt(config.widen) < 2.0 * spread
+    assert 0.4 * spread < laplace / np.sqrt(config.widen) < 2.5 * spread  # of one-sided differences
     along = np.array([mean[2], mean[3]]) / np.hypot(mean[2], mean[3])
     assert along @ covariance[2:4, 2:4] @ along == pytest.approx(0.66**2, rel=0.15)
 
@@ -147,14 +158,16 @@ def _tiny():
 @pytest.mark.parametrize("sample_pose", [True, False])
 def test_the_modes_of_a_view_are_sought_where_the_encoder_says(sample_pose):
     model, picture, observation = _tiny()
-    config = InferConfig(lattice=8, modes=ModesConfig(starts=3, climb=AdamConfig(steps=2)))
+    config = InferConfig(lattice=8, modes=ModesConfig(starts=6, screen=AdamConfig(steps=2), climb=AdamConfig(steps=2)))
     found = modes_of(jax.random.key(1), model, observation, config, picture, sample_pose)
     assert found is not None
     dim = model.latent + 7 * sample_pose
     assert found.mean.shape == (4, dim) and np.isfinite(found.root).all() and np.isfinite(found.mean).all()
-    if sample_pose:  # three even yaws, hardly climbed
-        yaw = np.degrees(np.arctan2(found.mean[:3, model.latent + 1], found.mean[:3, model.latent]))
-        np.testing.assert_allclose(np.sort(np.mod(yaw, 360.0)), [60.0, 180.0, 300.0], atol=15.0)
+    if sample_pose:  # one of each two of six even yaws, hardly climbed
+        yaw = np.degrees(np.arctan2(found.mean[:3, model.latent + 1], found.mean[:3, model.latent])) + 180.0
+        nearest = np.round(yaw / 60.0)
+        np.testing.assert_allclose(yaw, 60.0 * nearest, atol=20.0)
+        np.testing.assert_array_equal(np.mod(nearest, 6) // 2, [0, 1, 2])
     else:  # it stands canonically, about the encoder's mean there
         zero = jnp.zeros(())
         mean, precision = potential_at(model, picture, Pose(zero, zero, zero, zero, zero))
@@ -194,7 +207,8 @@ def test_the_encoder_s_guess_weighs_yaws_by_their_mean_likelihood():
 
 
 def test_wrong_settings_are_refused():
-    for wrong in (dict(starts=0), dict(prior_share=0.0), dict(widen=0.0), dict(power=2.0), dict(difference=0.0)):
+    odd = dict(starts=3)
+    for wrong in (odd, dict(starts=0), dict(prior_share=0.0), dict(widen=0.0), dict(power=2.0), dict(difference=0.0)):
         with pytest.raises(ValueError, match=r"starts .* widen .* power .* prior_share"):
             ModesConfig(**wrong)
     with pytest.raises(ValueError, match="steps 0"):
