@@ -184,12 +184,20 @@ def main(
                 for line in answered.values():
                     append_line(results, line)
                 say(f"{condition}, {number}: " + ", ".join(f"{m} {v['hidden_nll']:.3f}" for m, v in answered.items()))
-    lines = [line for line in newest(read_lines(results), loaded.hash, seed) if line["condition"] in asked]
+    lines = _answered_by_all([x for x in newest(read_lines(results), loaded.hash, seed) if x["condition"] in asked])
     if not lines:
         raise ValueError(f"{results} has no results of this prior and these conditions; leave --only-chart")
     rows = _rows(lines)
     _draw(lines, out / "calibration.png")
     return rows
+
+
+def _answered_by_all(lines: list[Line]) -> list[Line]:
+    """Those of objects that every method has answered: the rivals' outlast a change of the sampler."""
+    methods: dict[tuple[str, int], set[str]] = {}
+    for line in lines:
+        methods.setdefault((line["condition"], line["object"]), set()).add(line["method"])
+    return [line for line in lines if len(methods[line["condition"], line["object"]]) == len(METHODS)]
 
 
 def _settings(config: ControllerConfig, rivals: RivalConfig, quick: bool) -> dict[str, Line]:

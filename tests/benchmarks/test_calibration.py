@@ -1,13 +1,16 @@
 """Calibration's sums: an error pooled over objects, ranks of draws from the model, the band of uniform samples."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.calibration import called_free, pooled_ece
+from benchmarks.calibration import _answered_by_all, _settings, called_free, pooled_ece
 from benchmarks.results import append_line
+from benchmarks.rivals import METHODS, POSTERIOR, RivalConfig
 from benchmarks.sbc import CONDITIONS, STATISTICS, identity, main, outside, ranks_of
+from perception.controller import ControllerConfig
 from probnerf.metrics import ECE_BINS, uniform_band
 
 
@@ -28,6 +31,18 @@ def test_what_is_called_free_at_a_risk() -> None:
     assert (found["wrong_at_0.02"], found["free_at_0.02"]) == (0.0, 0.25)
     assert found["wrong_at_0.1"] == pytest.approx(1 / 3)
     assert np.isnan(called_free(np.zeros(2), np.ones(2, bool))["wrong_at_0.2"])
+
+
+def test_rivals_answers_outlast_a_change_of_the_sampler_and_are_shown_beside_the_new_ones_alone() -> None:
+    config, rivals = ControllerConfig(), RivalConfig()
+    before = _settings(config, rivals, False)
+    other_sampler = _settings(replace(config, tolerance=0.5), rivals, False)
+    assert [m for m in METHODS if before[m] != other_sampler[m]] == [POSTERIOR]
+    other_pixels = _settings(replace(config, infer=replace(config.infer, wall_sigma=0.1)), rivals, False)
+    assert all(before[m] != other_pixels[m] for m in METHODS)
+    lines = [{"condition": "any view", "object": n, "method": m} for n in (1, 2) for m in METHODS]
+    lines = [line for line in lines if (line["object"], line["method"]) != (2, POSTERIOR)]
+    assert {line["object"] for line in _answered_by_all(lines)} == {1}
 
 
 @pytest.mark.parametrize("n", [20, 200])
