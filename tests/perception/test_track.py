@@ -134,6 +134,16 @@ def test_a_view_from_the_side_takes_some_doubt_away() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
+@pytest.mark.xfail(strict=False, reason="not with every seed: three give 0.74, 0.86 and 0.84, on one machine")
+def test_a_view_from_the_side_takes_a_fifth_of_doubt_away() -> None:
+    tracker = Tracker(load_prior(), QUICK)
+    first, side = frame_from(0.0), frame_from(100.0, stamp_ns=20)
+    begun = tracker.update(first, segment(first)[0], stages=24).hypotheses
+    assert uncertainty(tracker.update(side, segment(side)[0], stages=24).hypotheses) < 0.8 * uncertainty(begun)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_a_tracker_repeats_itself_given_the_same_stages() -> None:
     def run() -> list[Hypotheses]:
         tracker = Tracker(load_prior(), QUICK, seed=5)
