@@ -19,16 +19,14 @@ Results are appended to a file, vessel by vessel, and what is there is not made 
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
 from fnmatch import fnmatch
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.frontier_chart import draw_frontier
 from benchmarks.kernel import matrix_speed
-from benchmarks.methods import CONDITIONS, DEPTHS, FULL, METHODS, Method, Question, answer
+from benchmarks.methods import CONDITIONS, DEPTHS, FULL, METHODS, Method, Question, answer, settings_of
 from benchmarks.results import Line, append_line, key, newest, read_lines
 from benchmarks.rows import Row
 from benchmarks.scene import base_rate, vessel_picture, vessel_view
@@ -153,15 +151,6 @@ def _measure(prior: Prior, methods: list[Method], conditions: list[str], n: int,
                     f"vessel {number} ({vessels}), {condition}: {method.name}: {found['hidden_nll']:.3f} nats,"
                     f" {found['psnr_heldout']:.1f} dB, {found['seconds']:.1f} s {found['result']}"
                 )
-
-
-def settings_of(method: Method, config: ControllerConfig) -> Line:
-    """A method's own settings, and a digest of all else that observation and inference were set to."""
-    own = ("smc", "smc_from_prior", "modes")  # of the sampler, which other methods do not have
-    infer = {name: value for name, value in asdict(config.infer).items() if method.smc or name not in own}
-    shared = {"infer": infer, "observe": asdict(config.observe), "hypotheses": config.hypotheses}
-    digest = sha256(json.dumps(shared, sort_keys=True, default=str).encode()).hexdigest()[:8]
-    return {**method.settings, "config": digest}
 
 
 def _refusal(condition: str, common: Line) -> Line:

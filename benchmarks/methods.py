@@ -7,10 +7,12 @@ none, only evaluations; starts of the sampler are evaluated as well, which only 
 same pixels, likelihood and prior.
 """
 
+import json
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from hashlib import sha256
 from typing import Any
 
 import jax
@@ -18,10 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks.rivals import RivalConfig, encoder_alone
+from benchmarks.results import Line
+from benchmarks.rivals import RivalConfig, encoder_alone, encoder_picture
 from benchmarks.scene import GRID, VesselView
 from benchmarks.score import Answer
-from perception.controller import ControllerConfig, crop, estimate
+from perception.controller import ControllerConfig, estimate
 from perception.observe import ObjectFrame, observe
 from perception.seen import answered_voxels
 from probnerf.annealed import AnnealedHMCConfig
@@ -71,11 +74,7 @@ class Question:
 
     @property
     def picture(self) -> Picture:
-        """The encoder's; without depth the object is at an unknown range."""
-        frame = self.view.frame
-        if frame.depth is None:
-            frame = replace(frame, depth=np.full(frame.rgb.shape[:2], np.nan, np.float32))
-        return crop(frame, self.view.segment, self.observed[1], self.prior.model.preset.image_size)
+        return encoder_picture(self.view, self.observed[1], self.prior)
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,15 +223,16 @@ def _estimate(
     return Method(name, group, label, sample, settings, conditions, programs, smc=True)
 
 
-FULL = "paper 100x100"  # the paper's own schedule; it takes long
+VI, PAPER = _vi(VIConfig()), _hmc("paper", "paper", annealed(100, 100), TELLING)
+FULL = PAPER.name  # the paper's own schedule; it takes long
 METHODS = (
     _encoder(),
     _map(),
-    _vi(VIConfig()),
+    VI,
     _hmc("paper", "paper", annealed(10, 10)),
     _hmc("paper", "paper", annealed(20, 20)),
     _hmc("paper", "paper", annealed(50, 50), WITH_DEPTH),
-    _hmc("paper", "paper", annealed(100, 100), TELLING),
+    PAPER,
     _hmc("fixed", "fixed temperature", replace(annealed(20, 100), s_start=0.1), TELLING),
     _estimate("smc", "smc", "x1", stages=60),
     _estimate("smc, 3 runs", "smc", "x3", stages=180, particles=192, conditions=TELLING),
@@ -264,6 +264,15 @@ METHODS = (
         for s in (1.0, 3.0, 10.0, 30.0)
     ),
 )
+
+
+def settings_of(method: Method, config: ControllerConfig) -> Line:
+    """A method's own settings, and a digest of all else that observation and inference were set to."""
+    own = ("smc", "smc_from_prior", "modes")  # of the sampler, which other methods do not have
+    infer = {name: value for name, value in asdict(config.infer).items() if method.smc or name not in own}
+    shared = {"infer": infer, "observe": asdict(config.observe), "hypotheses": config.hypotheses}
+    digest = sha256(json.dumps(shared, sort_keys=True, default=str).encode()).hexdigest()[:8]
+    return {**method.settings, "config": digest}
 
 
 def answer(method: Method, question: Question, short: bool = False) -> tuple[Answer, Sampled, Float[Array, "S d"]]:

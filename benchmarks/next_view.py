@@ -22,11 +22,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
-from benchmarks.calibration import any_view
 from benchmarks.results import Line, append_line, key, newest, read_lines
 from benchmarks.rows import Row
 from benchmarks.scene import GRID, VesselPicture, VesselView, base_rate, vessel_view
 from benchmarks.summary import mean_rows, say, table
+from benchmarks.unseen import any_view
 from perception.controller import ControllerConfig
 from perception.hypotheses import Hypotheses
 from perception.next_view import rank_views, ring_of_views

@@ -23,11 +23,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
-from benchmarks.calibration import ANY, views
 from benchmarks.rows import Row
 from benchmarks.scene import GRID, VesselView, base_rate
 from benchmarks.score import random_boxes
 from benchmarks.summary import mean_rows, say, table
+from benchmarks.unseen import ANY, views
 from perception.controller import estimate
 from perception.hypotheses import Hypotheses
 from perception.query import Box, Points, Swept, marginal, query

@@ -23,10 +23,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
-from benchmarks.calibration import ANY, views
 from benchmarks.rows import Row
 from benchmarks.scene import GRID, VesselView
 from benchmarks.summary import say, table
+from benchmarks.unseen import ANY, views
 from examples.reach import Gripper, Reach, choose, reaches
 from perception.controller import estimate
 from perception.hypotheses import Hypotheses

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from benchmarks.scene import GRID, VesselView
 from benchmarks.score import Answer
 from perception.controller import ControllerConfig, crop, estimate
-from perception.observe import observe
+from perception.observe import ObjectFrame, observe
 from perception.seen import answered_voxels
 from perception.segment import Segment
 from perception.source import Frame
@@ -54,7 +54,7 @@ def answers(
         h = found.hypotheses
         result[POSTERIOR] = Answer(coarsen(h.solid, GRID), h.weights, found.seconds, h.result)
     observation, cube = observe(vessel.frame, vessel.segment, config.observe, seed)
-    picture = crop(vessel.frame, vessel.segment, cube, prior.model.preset.image_size)
+    picture = encoder_picture(vessel, cube, prior)
     likelihood = likelihood_of(config.infer, observation)
     model, key = prior.model, jax.random.key(seed)
     dim = likelihood.dim(model)
@@ -78,6 +78,14 @@ def answers(
         best, _ = map_estimate(model, likelihood, observation, starts, rivals.fit)
         result[MAP] = answer(best[None], np.ones(1), begun)
     return result
+
+
+def encoder_picture(vessel: VesselView, cube: ObjectFrame, prior: Prior) -> Picture:
+    """What the encoder sees; without depth the object is at an unknown range."""
+    frame = vessel.frame
+    if frame.depth is None:
+        frame = replace(frame, depth=np.full(frame.rgb.shape[:2], np.nan, np.float32))
+    return crop(frame, vessel.segment, cube, prior.model.preset.image_size)
 
 
 def warm_up(

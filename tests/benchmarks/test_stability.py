@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.calibration import any_view
 from benchmarks.faults import AXES, Axis, noise_frame, occlusion
 from benchmarks.scene import base_rate, vessel_view
 from benchmarks.stability import FIRST, Seen, look, main
+from benchmarks.unseen import any_view
 from perception.controller import ControllerConfig
 from perception.source import Frame
 from probnerf.families.tabletop import TEST_SEEDS
