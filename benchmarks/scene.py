@@ -75,7 +75,7 @@ class VesselView:
     frame: Frame  # with the sensor's faults, and the true mask as label 1
     segment: Segment
     cube: ObjectFrame
-    shape: TabletopObject
+    shape: TabletopObject | None  # None: none of the family
     T_canonical_view: Float[np.ndarray, "4 4"]  # affine: from the view's cube to the shape's, cube units both
     solid: Bool[np.ndarray, "32 32 32"]
     seen: Bool[np.ndarray, "32 32 32"]  # by the true geometry
@@ -162,12 +162,18 @@ def simulated_camera(config: ViewConfig) -> Camera:
 def place(seed: int, rng: np.random.Generator, config: ViewConfig) -> tuple[Placed, Float[np.ndarray, "4 4"]]:
     """A random placement and T_world_camera."""
     placed = Placed(seed, rng.uniform(-0.05, 0.05), rng.uniform(-0.05, 0.05), rng.uniform(-np.pi, np.pi))
-    middle = placed.T_world_object[:3, 3]
+    return placed, stand(placed.T_world_object[:3, 3], placed.half_extent, rng, config)
+
+
+def stand(
+    middle: Float[np.ndarray, "3"], half_extent: float, rng: np.random.Generator, config: ViewConfig
+) -> Float[np.ndarray, "4 4"]:
+    """T_world_camera of a random camera that looks at an object about `middle` (world frame, m)."""
     azimuth, elevation = rng.uniform(-0.3, 0.3), np.deg2rad(rng.uniform(*config.elevation))  # it faces the wall
-    distance = max(rng.uniform(*config.distance), config.nearest * placed.half_extent)
+    distance = max(rng.uniform(*config.distance), config.nearest * half_extent)
     towards = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
     position, target = middle + distance * towards, middle + rng.normal(0.0, config.aim, 3)
-    return placed, place_camera(tuple(position), tuple(target))
+    return place_camera(tuple(position), tuple(target))
 
 
 def _shows_handle(obj: TabletopObject, T_object_camera: Float[np.ndarray, "4 4"], size: int = 96) -> bool:

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from benchmarks.scene import VesselView
+from benchmarks.scene import GRID, VesselView
+from perception.hypotheses import Hypotheses
+from perception.query import CAUTION
 from probnerf import foam
 from probnerf.families.render import look_at, pinhole_rays, trace
 from probnerf.metrics import (
@@ -21,6 +23,7 @@ from probnerf.metrics import (
     smooth_probability,
 )
 from probnerf.model import Likelihood, split_position
+from probnerf.occupancy import coarsen
 from probnerf.prior import ProbNeRF
 from probnerf.types import Rays
 from probnerf.views import ENCODER_RADIUS
@@ -40,6 +43,16 @@ class Answer:
     @property
     def p_occupied(self) -> Float[np.ndarray, "32 32 32"]:
         return np.tensordot(self.weights, self.shapes, 1)
+
+
+def as_queried(h: Hypotheses, seconds: float) -> Answer:
+    """What a query answers of the hypotheses: out of the model, half the weight on "all that is unseen is occupied"."""
+    shapes, weights = coarsen(h.solid, GRID), h.weights
+    if h.out_of_model:
+        fine = h.grid // GRID
+        seen = np.asarray(h.seen.reshape(GRID, fine, GRID, fine, GRID, fine).all(axis=(1, 3, 5)))
+        shapes, weights = np.concatenate([shapes, ~seen[np.newaxis]]), np.append((1 - CAUTION) * weights, CAUTION)
+    return Answer(shapes, weights, seconds, h.result)
 
 
 def random_boxes(
@@ -152,6 +165,7 @@ def picture_psnr(
     ]
     origin, direction = (np.concatenate(a) for a in zip(*seen, strict=True))
     A = view.T_canonical_view
+    assert view.shape is not None  # pictures are of the family's objects
     turned = direction @ A[:3, :3].T
     turned /= np.linalg.norm(turned, axis=1, keepdims=True)
     truth = np.asarray(trace(view.shape, (origin @ A[:3, :3].T + A[:3, 3]).astype(np.float32), turned)[2])

@@ -20,18 +20,16 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from benchmarks.calibration import any_view
 from benchmarks.faults import AXES, Axis
 from benchmarks.results import Line, append_line, key, read_lines
 from benchmarks.rows import Row
-from benchmarks.scene import GRID, VesselPicture, base_rate, vessel_view
-from benchmarks.score import BOXES, Answer, random_boxes, score
+from benchmarks.scene import VesselPicture, base_rate, vessel_view
+from benchmarks.score import BOXES, as_queried, random_boxes, score
 from benchmarks.summary import interval, say, table
+from benchmarks.unseen import any_view
 from perception.controller import ControllerConfig, estimate
-from perception.query import CAUTION
 from probnerf.families.tabletop import TEST_SEEDS
 from probnerf.metrics import falsely_free, paired_interval, scored_voxels
-from probnerf.occupancy import coarsen
 from probnerf.store import Prior, load_prior
 
 RESULTS = Path(__file__).with_suffix(".jsonl")
@@ -72,13 +70,7 @@ def look(
     if not scored.any():  # the cube is elsewhere
         return Seen(None, h.out_of_model)
     p = h.p_occupied
-    answer = Answer(coarsen(h.solid, GRID), h.weights, found.seconds)
-    if h.out_of_model:  # what a query answers: half the weight on "all that is unseen is occupied"
-        seen = h.seen.reshape(GRID, 2, GRID, 2, GRID, 2)
-        hidden = np.asarray(np.logical_not(seen.all(axis=(1, 3, 5))))
-        shapes = np.concatenate([answer.shapes, hidden[np.newaxis]])
-        answer = Answer(shapes, np.append((1 - CAUTION) * h.weights, CAUTION), found.seconds)
-    judged = score(view, answer, rate, random_boxes(scored, BOXES, rng), rng)
+    judged = score(view, as_queried(h, found.seconds), rate, random_boxes(scored, BOXES, rng), rng)
     nll = judged.values["hidden_nll"]
     if not (np.isfinite(p).all() and np.isfinite(nll)):
         return Seen(None, h.out_of_model, broken="not finite")
