@@ -249,7 +249,7 @@ METHODS = (
         "smc, one move", "lever off", "O one move a beta", stages=60, smc={"least_moved": 0.0}, conditions=TELLING
     ),
     _estimate("smc, lattice 16", "lever off", "C coarse lattice", stages=60, infer={"lattice": 16}, conditions=TELLING),
-    _estimate("smc, power 0.5", "lever off", "K power 0.5", stages=60, infer={"power": 0.5}, conditions=TELLING),
+    _estimate("smc, power 1", "lever off", "K power 1", stages=60, infer={"power": 1.0}, conditions=TELLING),
     _estimate("smc, no metric", "lever off", "M prior's metric", stages=60, smc={"metric": False}, conditions=TELLING),
     _estimate(
         "smc, 6 leapfrog steps",

@@ -76,7 +76,8 @@ class InferConfig:
     wall_sigma: float = 0.05  # cube units: the model's own error in a wall's place; wide, for small misfits are shared
     outlier: float = 0.01  # share of ranges from nowhere; small, for a lid over a visible cavity is no outlier
     reach: float = 0.3  # cube units behind a measured range beyond which nothing is asked
-    power: float = 1.0  # kappa: what one pixel counts for
+    # kappa: what one ray counts for, which stands for many pixels; with 1 validation objects' answers were too cautious
+    power: float = 2.0
     encoder_starts: bool = True  # begin at the modes that the encoder's guesses climb to; otherwise at the prior
     sample_delta: bool = False  # also infer the weights' perturbation delta
 
