@@ -107,6 +107,11 @@ def noise_frame(frame: Frame, amount: float) -> Frame:
     return replace(frame, rgb=rgb, depth=np.where(lost, drawn, frame.depth).astype(np.float32))
 
 
+def no_depth(frame: Frame, amount: float) -> Frame:
+    """Colour alone, with the true mask and the camera's pose over the table, at any amount but 0."""
+    return replace(frame, depth=None) if amount else frame
+
+
 @dataclass(frozen=True)
 class Axis:
     """One thing that is made worse: by a fault of the frame, or by another configuration."""
@@ -123,6 +128,12 @@ def _infer(name: str) -> Callable[[ControllerConfig, float], ControllerConfig]:
         return replace(config, infer=replace(config.infer, **{name: value}))
 
     return configured
+
+
+def _pose_prior(config: ControllerConfig, amount: float) -> ControllerConfig:
+    o = config.observe
+    names = ("xy_sigma", "log_scale_sigma", "hidden_sigma", "side_sigma")
+    return replace(config, observe=replace(o, **{name: amount * getattr(o, name) for name in names}))
 
 
 def _particles(config: ControllerConfig, amount: float) -> ControllerConfig:
@@ -146,6 +157,7 @@ AXES = (
     Axis("depth scale, share", (0.0, 0.02, 0.05, 0.1, 0.2), depth_scale),
     Axis("depth noise, m", (0.0, 0.003, 0.01, 0.03), depth_noise),
     Axis("depth holes, share", (0.0, 0.3, 0.6, 0.9), holes),
+    Axis("depth absent", (0.0, 1.0), no_depth),
     Axis("flying pixels, px", (0.0, 2.0, 4.0, 8.0), flying),
     Axis("mask beside, px", (0.0, 3.0, 10.0, 30.0), mask_shift),
     Axis("plane tilted, degrees", (0.0, 1.0, 3.0, 10.0), plane_tilt),
@@ -153,6 +165,8 @@ AXES = (
     Axis("noise instead of shape, share", (0.0, 0.1, 0.3, 1.0), noise_frame),
     Axis("wall_sigma, times", (1.0, 0.3, 0.1), configured=_infer("wall_sigma")),
     Axis("wall_sigma too large, times", (1.0, 3.0, 10.0), configured=_infer("wall_sigma")),
+    Axis("pose prior, times", (1.0, 0.3, 0.1), configured=_pose_prior),
+    Axis("pose prior too wide, times", (1.0, 3.0), configured=_pose_prior),
     Axis("lattice, times", (1.0, 0.5, 0.25), configured=_infer("lattice")),
     Axis("pixels, times", (1.0, 0.5, 0.25, 0.125), configured=_rays),
     Axis("particles, times", (1.0, 0.33, 0.1, 0.05), configured=_particles),
