@@ -1,8 +1,7 @@
 """Does p_occupied mean what it says: the posterior and its rivals over unseen space, objects of every kind.
 
-Test seeds, the whole path from frame to hypotheses, yaw unknown, under the conditions of `benchmarks.unseen`. Prior,
-encoder and MAP answer all of them; mean-field VI and the paper's annealed HMC (its last 16 states), which take long,
-the first `slow`.
+Test seeds, the whole path from frame to hypotheses, under the conditions of `benchmarks.unseen`. Prior, encoder and MAP
+answer all of them; mean-field VI and the paper's annealed HMC (its last 16 states), which take long, the first `slow`.
 
 Measures: as `farside bench hidden`, over unseen voxels whose training-set frequency lies in (0.02, 0.98), smoothed
 alike. energy_score: of whole shapes, over all unseen voxels. hidden_ece here pools the voxels of all objects (15 bins);
@@ -124,7 +123,7 @@ def main(
     settings = _settings(config, rivals, quick)
     if not only_chart:
         done = {key(line) for line in read_lines(results)}
-        rate = base_rate(128 if quick else 1024, config=config.observe)
+        rates = {k: base_rate(128 if quick else 1024, config=config.observe, pose_known=k) for k in (False, True)}
         for condition, methods, count in ((c, m, k) for c in asked for m, k in ((METHODS, n), (tuple(SLOW), slow))):
 
             def missing(number: int, condition: str = condition, methods: Sequence[str] = methods) -> dict[str, Line]:
@@ -139,7 +138,9 @@ def main(
                 given = answers(view, loaded, config, rivals, seed, None, 240, [m for m in asked_of if m in METHODS])
                 question = Question(view, loaded, config, seed)
                 given |= {m: answer(SLOW[m], question)[0] for m in asked_of if m in SLOW}
-                answered = {m: {**asked_of[m], **judged(view, a, rate, seed)} for m, a in given.items()}
+                answered = {
+                    m: {**asked_of[m], **judged(view, a, rates[view.pose_known], seed)} for m, a in given.items()
+                }
                 for line in answered.values():
                     append_line(results, line)
                 say(f"{condition}, {number}: " + ", ".join(f"{m} {v['hidden_nll']:.3f}" for m, v in answered.items()))

@@ -35,7 +35,7 @@ from probnerf.model import Likelihood, faces_of_view, log_likelihood
 from probnerf.modes import log_posterior
 from probnerf.occupancy import coarsen, solid
 from probnerf.populations import thin
-from probnerf.proposal import Picture, encoder_positions, even_yaws
+from probnerf.proposal import Picture, guesses
 from probnerf.store import Prior
 from probnerf.types import Diagnostics, Observation, Posterior
 
@@ -56,7 +56,7 @@ class Question:
 
     @cached_property
     def observed(self) -> tuple[Observation, ObjectFrame]:
-        return observe(self.view.frame, self.view.segment, self.config.observe, self.seed)
+        return observe(self.view.frame, self.view.segment, self.config.observe, self.seed, self.view.cube)
 
     @property
     def key(self) -> Array:
@@ -64,7 +64,7 @@ class Question:
 
     @cached_property
     def likelihood(self) -> Likelihood:
-        return likelihood_of(self.config.infer, self.observed[0])
+        return likelihood_of(self.config.infer, self.observed[0], not self.view.pose_known)
 
     @property
     def arguments(self) -> tuple:
@@ -138,7 +138,7 @@ def _map() -> Method:
     fit = config.fit
 
     def sample(q: Question, _: bool) -> Sampled:
-        starts = encoder_positions(q.key, q.prior.model, q.picture, even_yaws(config.yaws), 1, 0.0)
+        starts = guesses(q.key, q.prior.model, q.picture, config.yaws, q.likelihood.sample_pose)
         best, _ = map_estimate(q.prior.model, q.likelihood, q.observed[0], starts, fit)
         gradients = config.yaws * fit.screen_steps + fit.survivors * fit.steps
         return _sampled(q, _weighted(best[None], np.ones(1), gradients), evaluations=config.yaws + fit.survivors)
@@ -151,7 +151,7 @@ def _vi(config: VIConfig) -> Method:
 
     def sample(q: Question, _: bool) -> Sampled:
         args = q.arguments
-        starts = encoder_positions(q.key, q.prior.model, q.picture, even_yaws(yaws), 1, 0.0)
+        starts = guesses(q.key, q.prior.model, q.picture, yaws, q.likelihood.sample_pose)
         at = int(jnp.argmax(jnp.nan_to_num(jax.jit(log_posterior)(args, None, starts), nan=-jnp.inf)))
         found, _ = mean_field(q.key, log_likelihood, args, starts[at], config)
         count = q.config.hypotheses
@@ -165,7 +165,10 @@ def _vi(config: VIConfig) -> Method:
 def _hmc(name: str, group: str, hmc: AnnealedHMCConfig, conditions: tuple[str, ...] = CONDITIONS) -> Method:
     def sample(q: Question, short: bool) -> Sampled:
         config = replace(q.config.infer, method="annealed_hmc", hmc=hmc)
-        posterior, _ = infer(q.key, q.prior.model, q.observed[0], config, stages=1 if short else None)
+        known = q.view.pose_known
+        posterior, _ = infer(
+            q.key, q.prior.model, q.observed[0], config, sample_pose=not known, stages=1 if short else None
+        )
         return _sampled(q, posterior)
 
     return Method(f"{name} {_schedule(hmc)}", group, _schedule(hmc), sample, asdict(hmc), conditions)

@@ -21,7 +21,7 @@ from probnerf.infer import encoder_guess, likelihood_of, opacity_grids
 from probnerf.model import Likelihood
 from probnerf.occupancy import coarsen, solid
 from probnerf.prior import ProbNeRF
-from probnerf.proposal import Picture, encoder_positions, even_yaws
+from probnerf.proposal import Picture, guesses
 from probnerf.store import Prior
 from probnerf.types import Observation
 
@@ -50,12 +50,15 @@ def answers(
     """The methods' answers to the same observation."""
     result: dict[str, Answer] = {}
     if POSTERIOR in methods:
-        found = estimate(vessel.frame, vessel.segment, prior, config, seed=seed, budget_s=budget_s, stages=stages)
+        known = vessel.cube if vessel.pose_known else None
+        found = estimate(
+            vessel.frame, vessel.segment, prior, config, seed=seed, known=known, budget_s=budget_s, stages=stages
+        )
         h = found.hypotheses
         result[POSTERIOR] = Answer(coarsen(h.solid, GRID), h.weights, found.seconds, h.result)
-    observation, cube = observe(vessel.frame, vessel.segment, config.observe, seed)
+    observation, cube = observe(vessel.frame, vessel.segment, config.observe, seed, vessel.cube)
     picture = encoder_picture(vessel, cube, prior)
-    likelihood = likelihood_of(config.infer, observation)
+    likelihood = likelihood_of(config.infer, observation, not vessel.pose_known)
     model, key = prior.model, jax.random.key(seed)
     dim = likelihood.dim(model)
     asked = jnp.asarray(answered_voxels(vessel.frame, vessel.segment, cube, config.grid))
@@ -74,7 +77,7 @@ def answers(
         result[ENCODER] = answer(drawn, weights, begun)
     if MAP in methods:
         begun = time.monotonic()
-        starts = encoder_positions(key, model, picture, even_yaws(rivals.yaws), 1, 0.0)
+        starts = guesses(key, model, picture, rivals.yaws, likelihood.sample_pose)
         best, _ = map_estimate(model, likelihood, observation, starts, rivals.fit)
         result[MAP] = answer(best[None], np.ones(1), begun)
     return result

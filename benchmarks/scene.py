@@ -82,6 +82,7 @@ class VesselView:
     near_handle: Bool[
         np.ndarray, "32 32 32"
     ]  # outside the body, where the true handle passes as it turns about the axis
+    pose_known: bool = False  # the cube is the object's own
 
 
 def vessel_picture(seed: int, handle: Handle, config: ViewConfig | None = None) -> VesselPicture | None:
@@ -110,20 +111,27 @@ def vessel_picture(seed: int, handle: Handle, config: ViewConfig | None = None) 
 
 
 def vessel_view(
-    picture: VesselPicture, depth: bool = True, fault: Callable[[Frame], Frame] | None = None
+    picture: VesselPicture,
+    depth: bool = True,
+    fault: Callable[[Frame], Frame] | None = None,
+    pose_known: bool = False,
 ) -> VesselView:
     """What perception makes of a picture through a faulty sensor, with the truth in the cube that it chose.
 
     A `fault` is done to the frame on top of the sensor's; what is truly seen and there stays what it is. Without
     `depth` the segment is the true mask's, on the plane that the camera's pose over the table gives (with
-    `PlaneGuess`'s errors of it): what a user has to say of a picture. Raises ValueError where perception refuses.
+    `PlaneGuess`'s errors of it): what a user has to say of a picture. With `pose_known` the cube is the object's own,
+    as a marker on it would tell. Raises ValueError where perception refuses.
     """
     placed, camera, seed = picture.placed, picture.camera, picture.placed.seed
     frame = sense(picture.picture, camera, picture.T_world_camera, seed)
     frame = frame if depth else replace(frame, depth=None)
     frame = frame if fault is None else fault(frame)
     found = segment(frame, 1)[0]
-    cube = object_frame(frame, found, ObserveConfig())
+    if pose_known:
+        cube = ObjectFrame(picture.T_camera_object, placed.half_extent, found.plane, 0.0, 0.0)
+    else:
+        cube = object_frame(frame, found, ObserveConfig())
     faultless = Frame(0, frame.frame_id, frame.rgb, picture.picture.depth.astype(np.float32), None, camera)
     T_canonical_view = _affine(cube, picture.T_camera_object, placed.half_extent)
     body, handle = (np.asarray(a) for a in _parts(placed.shape, T_canonical_view, FINE))
@@ -138,6 +146,7 @@ def vessel_view(
         solid=coarsen(solid((body | handle).astype(np.float32)), GRID),
         seen=seen_voxels(faultless, found, cube, GRID),
         near_handle=swept & ~coarsen(body, GRID),
+        pose_known=pose_known,
     )
 
 
@@ -257,13 +266,18 @@ def _frequency(objects: TabletopObject, poses: Pose, grid: int) -> Float[Array, 
     return total / poses.yaw.shape[0]
 
 
-def base_rate(objects: int = 1024, grid: int = GRID, config: ObserveConfig | None = None) -> Float[np.ndarray, "g g g"]:
+def base_rate(
+    objects: int = 1024, grid: int = GRID, config: ObserveConfig | None = None, pose_known: bool = False
+) -> Float[np.ndarray, "g g g"]:
     """Training-set frequency of occupancy in the view frame: family objects at any yaw, placed by perception's widths.
 
-    All stand on the plane (z = 0). The law has the cube's symmetries about the vertical (quarter turns, a mirror), so
-    the estimate is averaged over all eight.
+    With `pose_known` in their own cubes. Otherwise all stand on the plane (z = 0), and the law has the cube's
+    symmetries about the vertical (quarter turns, a mirror), so the estimate is averaged over all eight.
     """
     config = config or ObserveConfig()
+    if pose_known:
+        own = Pose(*[jnp.zeros(objects)] * 5)
+        return np.asarray(_frequency(sample_objects(TRAIN_SEEDS[:objects]), own, grid), np.float64)
     rng = np.random.default_rng(29)
     yaw, spread = rng.uniform(-np.pi, np.pi, objects), rng.standard_normal((3, objects))
     x, y, log_scale = spread * np.array([[config.xy_sigma], [config.xy_sigma], [config.log_scale_sigma]])

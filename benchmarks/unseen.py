@@ -3,6 +3,7 @@
 - any view: the next objects of the family as they come, any kind, from a random camera. Nothing is selected by what the
   view hides, so a right posterior is calibrated here.
 - any view, colour only: the same without depth; the plane is the one that the camera's pose gives.
+- any view, pose known: the same, in the object's own cube, as a marker on it would tell it.
 - half hidden: as any view, with a carton before them that hides 35 to 65% of their pixels.
 - handle hidden: vessels whose handle no pixel shows. They are selected by a truth that the view leaves open (every one
   has a handle): even a right posterior errs here, towards no handle.
@@ -19,7 +20,8 @@ from benchmarks.scene import VesselPicture, VesselView, ViewConfig, place, simul
 from perception.simulate import Scene, render
 from probnerf.families.tabletop import TEST_SEEDS
 
-ANY, COLOUR, HALF, HANDLE = "any view", "any view, colour only", "half hidden", "handle hidden"
+ANY, COLOUR, KNOWN = "any view", "any view, colour only", "any view, pose known"
+HALF, HANDLE = "half hidden", "handle hidden"
 
 
 def any_view(seed: int) -> VesselPicture:
@@ -38,6 +40,7 @@ def _half(seed: int) -> VesselPicture | None:
 SORTS: dict[str, tuple[int, Callable[[int], VesselPicture | None]]] = {
     ANY: (0, any_view),
     COLOUR: (0, any_view),
+    KNOWN: (0, any_view),
     HALF: (2000, _half),
     HANDLE: (4000, partial(vessel_picture, handle="hidden")),
 }
@@ -57,7 +60,7 @@ def views(condition: str, n: int, known: Callable[[int], bool]) -> Iterator[tupl
             continue
         picture = picture_of(seed)
         try:
-            view = None if picture is None else vessel_view(picture, depth=condition != COLOUR)
+            view = None if picture is None else vessel_view(picture, condition != COLOUR, pose_known=condition == KNOWN)
         except ValueError:  # outside perception's range of sizes, or too few pixels
             continue
         if view is not None:

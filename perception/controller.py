@@ -97,6 +97,7 @@ def estimate(
     config: ControllerConfig | None = None,
     *,
     seed: int = 0,
+    known: ObjectFrame | None = None,
     budget_s: float | None = None,
     stages: int | None = None,
     on_stage: Callable[[StageInfo], bool | None] | None = None,
@@ -104,19 +105,21 @@ def estimate(
 ) -> Estimate:
     """Hypotheses about one object of a frame; first ones, of fewer shapes, go to `on_answer` while it works.
 
-    With `stages` and no budget the answer is a function of the inputs alone.
+    With `stages` and no budget the answer is a function of the inputs alone. `known` is the object's own cube where its
+    pose is known already (the handle at +x), so that only its shape is inferred.
 
     Raises ValueError where the segment cannot be observed (too small, outside the prior's range of sizes).
     """
     config = config or ControllerConfig()
     begun = time.monotonic()
-    observation, cube = observe(frame, segment, config.observe, seed)
+    observation, cube = observe(frame, segment, config.observe, seed, known)
     view = View(frame, segment, observation, cube, seen_voxels(frame, segment, cube, config.grid))
     return infer_view(
         view,
         prior,
         config,
         seed=seed,
+        pose_known=known is not None,
         deadline=None if budget_s is None else begun + budget_s,
         stages=stages,
         on_stage=on_stage,
@@ -130,6 +133,7 @@ def infer_view(
     config: ControllerConfig,
     *,
     seed: int = 0,
+    pose_known: bool = False,
     before: Posterior | None = None,
     fresh: bool = True,
     deadline: float | None = None,
@@ -144,7 +148,7 @@ def infer_view(
     together. A further run that is cut short is left out.
     """
     begun = time.monotonic()
-    work = _Work(view, prior, config, seed, before, fresh, deadline, stages, on_stage, on_answer)
+    work = _Work(view, prior, config, seed, pose_known, before, fresh, deadline, stages, on_stage, on_answer)
     grows = before is None and config.infer.method == "tempered_smc"
     runs: list[Posterior] = []  # whole ones, but for a first
     log: list[str] = []
@@ -193,6 +197,7 @@ class _Work:
     prior: Prior
     config: ControllerConfig
     seed: int
+    pose_known: bool
     before: Posterior | None
     fresh: bool
     deadline: float | None
@@ -211,7 +216,7 @@ class _Work:
 
     @cached_property
     def likelihood(self) -> Likelihood:
-        return likelihood_of(self.config.infer, self.view.observation)
+        return likelihood_of(self.config.infer, self.view.observation, not self.pose_known)
 
     @property
     def smc(self) -> TemperedSMCConfig:
@@ -244,6 +249,7 @@ class _Work:
             self.config.infer,
             reference=self.reference,
             before=self.before,
+            sample_pose=not self.pose_known,
             on_stage=self._told,
             deadline=self.deadline,
             stages=None if self.cap is None else self.cap - self.stages,
@@ -260,7 +266,7 @@ class _Work:
         assert isinstance(model, ProbNeRF) and self.picture is not None
         if self.on_answer is not None and self.fresh:
             self._answer(encoder_guess(key, model, self.likelihood, self.view.observation, self.picture))
-        self.reference = modes_of(key, model, self.view.observation, config, self.picture)
+        self.reference = modes_of(key, model, self.view.observation, config, self.picture, not self.pose_known)
         climbed = config.modes.gradients(self.likelihood.dim(model))
         self.point_gradients += climbed * crossings_of(self.likelihood, self.view.observation)
 

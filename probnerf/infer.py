@@ -28,7 +28,7 @@ from probnerf.model import (
 from probnerf.modes import ModesConfig, mixture_of_modes
 from probnerf.populations import start_from
 from probnerf.prior import ProbNeRF
-from probnerf.proposal import Picture, encoder_positions, even_yaws
+from probnerf.proposal import Picture, encoder_positions, even_yaws, guesses
 from probnerf.smc import TemperedSMCConfig, tempered_smc
 from probnerf.types import BASE_Z, OBJECT, UNKNOWN, Diagnostics, Observation, Pose, Posterior
 
@@ -160,11 +160,7 @@ def modes_of(
         return None
     assert isinstance(model, ProbNeRF) and picture is not None
     likelihood = likelihood_of(config, observation, sample_pose)
-    count = config.modes.starts
-    if sample_pose:
-        starts = encoder_positions(key, model, picture, even_yaws(count), 1, 0.0)
-    else:
-        starts = encoder_positions(key, model, picture, np.zeros(1, np.float32), count, 1.0)[:, : model.latent]
+    starts = guesses(key, model, picture, config.modes.starts, sample_pose)
     args = (model, likelihood, observation, faces_of_view(observation, likelihood))
     return mixture_of_modes(args, starts, config.modes)
 
@@ -228,9 +224,14 @@ def encoder_guess(
     """What the encoder alone takes the object for, in a twentieth of a second: z_kj ~ q(z | picture, yaw_k) on a grid.
 
     The weight of yaw k is its mean likelihood, W_k = sum_j p(observation | z_kj, yaw_k) / J, shared evenly by its J
-    draws: within a yaw the encoder is taken at its word. x, y and scale are perception's guess; the pose is unknown.
+    draws: within a yaw the encoder is taken at its word. x, y and scale are perception's guess. Where the pose is
+    known there is one yaw, of which all are drawn.
     """
-    positions = encoder_positions(key, model, picture, even_yaws(yaws), draws, 1.0)
+    if likelihood.sample_pose:
+        positions = encoder_positions(key, model, picture, even_yaws(yaws), draws, 1.0)
+    else:
+        yaws, draws = 1, yaws * draws
+        positions = guesses(key, model, picture, draws, sample_pose=False)
     args = (model, likelihood, observation, faces_of_view(observation, likelihood))
     values = np.asarray(jax.jit(log_likelihood)(args, positions), np.float64)
     values = np.where(np.isfinite(values), values, -np.inf)

@@ -52,6 +52,15 @@ def encoder_positions(
     return _encoder_positions(model, picture, jnp.asarray(yaws), noise, spread)
 
 
+def guesses(
+    key: PRNGKeyArray, model: ProbNeRF, picture: Picture, count: int, sample_pose: bool = True
+) -> Float[Array, "count d"]:
+    """Where climbs start: the encoder's mean at even yaws; where the pose is known, latents drawn from it there."""
+    if sample_pose:
+        return encoder_positions(key, model, picture, even_yaws(count), 1, 0.0)
+    return encoder_positions(key, model, picture, np.zeros(1, np.float32), count, 1.0)[:, : model.latent]
+
+
 @jax.jit
 def _encoder_positions(
     model: ProbNeRF, picture: Picture, yaws: Float[Array, "y"], noise: Float[Array, "y j k"], spread: float

@@ -1,5 +1,7 @@
 """What the measurements measure with: scenes, truths and scores are what they claim to be."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,13 +18,16 @@ from benchmarks.frame import (
 from benchmarks.hidden import judge
 from benchmarks.prior import VIEWS, see
 from benchmarks.rivals import METHODS, POSTERIOR
-from benchmarks.scene import base_rate, hidden_vessel
+from benchmarks.scene import base_rate, hidden_vessel, vessel_picture, vessel_view
 from benchmarks.score import Answer, random_boxes
 from benchmarks.summary import mean_rows
+from perception.controller import ControllerConfig, estimate
 from perception.plane import heights
 from perception.segment import segment
 from perception.source import read_frame_folder
+from probnerf.infer import InferConfig, quick_smc
 from probnerf.occupancy import voxel_centres
+from probnerf.store import load_prior
 from probnerf.types import BASE_Z
 
 
@@ -52,6 +57,24 @@ def test_a_hidden_handle_is_there_and_unseen(vessel):
     assert handle.sum() > 20
     assert (handle & ~vessel.seen).sum() > 0.9 * handle.sum()
     assert vessel.near_handle.sum() > 3 * handle.sum()  # a ring, of which the handle is a part
+
+
+def test_where_the_pose_is_known_the_cube_is_the_object_s_own_and_only_its_shape_is_inferred():
+    picture = vessel_picture(2_000_001, "informative")
+    assert picture is not None
+    view = vessel_view(picture, pose_known=True)
+    np.testing.assert_allclose(view.T_canonical_view, np.eye(4), atol=1e-9)
+    handle = voxel_centres(32)[view.solid & view.near_handle]
+    assert handle[:, 0].min() > 0.0 and np.abs(handle[:, 1]).max() < 0.3  # the handle is at +x
+    rate = base_rate(24, pose_known=True)
+    assert rate[20:, 12:20].mean() > 1.1 * rate[:12, 12:20].mean()  # where handles are
+    prior = load_prior()
+    smc = replace(quick_smc(2, 2), start_particles=2)
+    infer = InferConfig(lattice=8, smc=smc, smc_from_prior=smc, encoder_starts=False)
+    config = ControllerConfig(infer=infer, hypotheses=4, grid=16)
+    found = estimate(view.frame, view.segment, prior, config, known=view.cube, stages=1)
+    assert found.posterior.positions.shape[-1] == prior.model.latent
+    assert not found.hypotheses.pose.any() and found.object_frame is view.cube
 
 
 def test_what_the_camera_saw_as_free_is_not_solid(vessel):
