@@ -36,7 +36,8 @@ from benchmarks.summary import say, table
 from perception.controller import ControllerConfig, Estimate, estimate
 from perception.hypotheses import Hypotheses, surface_points
 from perception.plane import heights
-from perception.query import Points, query
+from perception.query import query
+from perception.region import Points
 from perception.segment import Segment, segment
 from perception.source import Frame, read_frame_folder
 from probnerf.metrics import hidden_log_score, symmetric_chamfer

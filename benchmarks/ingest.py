@@ -29,8 +29,9 @@ from benchmarks.rows import Row
 from benchmarks.summary import say
 from perception.controller import estimate
 from perception.live import Counts, Reader
-from perception.query import Points, query
+from perception.query import query
 from perception.record import Recorder
+from perception.region import Points
 from perception.segment import segment
 from perception.source import Frame
 from perception.track import Tracker

@@ -30,7 +30,8 @@ from benchmarks.summary import mean_rows, say, table
 from benchmarks.unseen import ANY, views
 from perception.controller import estimate
 from perception.hypotheses import Hypotheses
-from perception.query import Box, Points, Swept, marginal, query
+from perception.query import marginal, query
+from perception.region import Box, Points, Swept
 from probnerf.metrics import paired_interval, scored_voxels
 from probnerf.occupancy import coarsen
 from probnerf.store import load_prior

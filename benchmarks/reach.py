@@ -30,7 +30,8 @@ from benchmarks.unseen import ANY, views
 from examples.reach import Gripper, Reach, choose, reaches
 from perception.controller import estimate
 from perception.hypotheses import Hypotheses
-from perception.query import CAUTION, Swept
+from perception.query import CAUTION
+from perception.region import Swept
 from probnerf.occupancy import coarsen, voxel_centres
 from probnerf.store import load_prior
 from probnerf.types import BASE_Z

@@ -91,15 +91,24 @@ def _record(args: Sequence[str]) -> int:
 
 def _query(args: Sequence[str]) -> int:
     options = tyro.cli(Query, args=args, prog="farside query")
-    if (options.box is None) == (options.points is None):
-        raise ValueError("a query needs either --box X0 Y0 Z0 X1 Y1 Z1 or --points FILE.xyz")
+    box, points, mesh = options.box, options.points, options.mesh
+    if sum(given is not None for given in (box, points, mesh)) != 1:
+        raise ValueError("a query needs one of --box X0 Y0 Z0 X1 Y1 Z1, --points FILE.xyz and --mesh FILE.obj")
     from node.answer import answer
-    from perception.query import Box
+    from perception.region import Box, Region, read_mesh
+    from perception.store import load_scene
     from perception.xyz import read_points
 
-    box, points = options.box, options.points
-    region = Box(box[:3], box[3:]) if box is not None else read_points(points)  # type: ignore[arg-type]
-    answer(options.file, region, options.frame, options.risk, options.json, Console())
+    scene = load_scene(options.file)
+    region: Region
+    if box is not None:
+        region = Box(box[:3], box[3:])
+    elif points is not None:
+        region = read_points(points)
+    else:
+        assert mesh is not None
+        region = read_mesh(mesh, 0.5 * min(h.voxel_m for h in scene))
+    answer(scene, region, options.frame, options.risk, options.json, Console())
     return 0
 
 

@@ -1,25 +1,27 @@
 """A region's answer in words and as JSON."""
 
 import json
-from pathlib import Path
+from collections.abc import Sequence
 
 from rich.console import Console
 from rich.table import Table
 
-from perception.hypotheses import FrameName
-from perception.query import Box, Points, QueryResult, query
-from perception.store import load_scene
+from perception.hypotheses import FrameName, Hypotheses
+from perception.query import QueryResult, query
+from perception.region import Region
 from perception.verdict import verdict
 
 CM3 = 1e6  # per cubic metre
 
 
-def answer(path: Path, region: Box | Points, frame: FrameName, risk: float, as_json: bool, out: Console) -> None:
-    """Ask the objects of a hypotheses file or folder about a region and print the answer, with a verdict at `risk`.
+def answer(
+    scene: Sequence[Hypotheses], region: Region, frame: FrameName, risk: float, as_json: bool, out: Console
+) -> None:
+    """Ask the objects of a scene about a region and print the answer, with a verdict at `risk`.
 
-    Raises FileNotFoundError or ValueError in one line.
+    Raises ValueError in one line.
     """
-    result = query(load_scene(path), region, frame)
+    result = query(scene, region, frame)
     said = verdict(result, risk)
     if as_json:
         told = {"verdict": said, "risk": risk, **result.as_dict()}
@@ -46,4 +48,11 @@ def rows(r: QueryResult) -> list[tuple[str, str]]:
         ),
         ("mean entropy", f"{r.entropy_nats:.3f} nats per voxel"),
         ("effective hypotheses", f"{r.effective_hypotheses:.1f}"),
+        *((f"not free in, object {o}", _numbers(rows)) for o, rows in r.blocked_by.items()),
     ]
+
+
+def _numbers(rows: list[int], shown: int = 8) -> str:
+    """How many hypotheses, and the first few of them."""
+    more = " ..." if len(rows) > shown else ""
+    return f"{len(rows)} hypotheses: " + " ".join(str(row) for row in rows[:shown]) + more

@@ -114,17 +114,20 @@ class Record:
 
 @dataclass(frozen=True)
 class Query:
-    """Ask how likely a box or some points are free, jointly over all hypotheses (and objects, if FILE is a folder)."""
+    """Ask how likely a box, some points or a mesh are free, jointly over all hypotheses (and objects, if FILE is a
+    folder)."""
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]
     """Hypotheses file (object_<id>.npz), or the folder that `farside replay` wrote."""
     box: Annotated[
         tuple[float, float, float, float, float, float] | None,
-        arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint="(this or --points)"),
+        arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint="(this, --points or --mesh)"),
     ] = None
     """Two opposite corners of an axis-aligned box, metres."""
-    points: Annotated[Path | None, arg(metavar="FILE.xyz", help_behavior_hint="(this or --box)")] = None
+    points: Annotated[Path | None, arg(metavar="FILE.xyz", help_behavior_hint="(this, --box or --mesh)")] = None
     """Text file of points, one a line: x y z in metres."""
+    mesh: Annotated[Path | None, arg(metavar="FILE.obj", help_behavior_hint="(this, --box or --points)")] = None
+    """Mesh (.obj, .stl, .ply, .off, .glb) in metres, in the frame of the question: what it fills."""
     frame: Literal["object", "camera", "world"] = "object"
     """Frame of the question. object: z up, x to the camera, the plane under the origin; camera: x right, y down."""
     risk: float = 0.05

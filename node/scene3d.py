@@ -11,7 +11,8 @@ from jaxtyping import Float, Int, UInt8
 
 from node import shade
 from perception.hypotheses import FrameName, Hypotheses, binary_entropy, by_weight, mesh
-from perception.query import Box, Points, QueryResult, query
+from perception.query import QueryResult, query
+from perception.region import Box, Points
 from perception.segment import Segment, backproject, segment
 from perception.source import Frame
 from probnerf.occupancy import voxel_centres

@@ -12,7 +12,8 @@ from node.bus import Bus
 from node.message import NEXT_VIEW, QUERY_REGION, make, matrix, pose, time_message
 from node.views import object_frame_id
 from perception.hypotheses import FrameName, Hypotheses
-from perception.query import Box, Points, Region, Swept, query
+from perception.query import query
+from perception.region import Box, Points, Region, Swept
 
 BOX, POINTS, SWEPT = 0, 1, 2  # kinds of a QueryRegion request
 MAX_BOXES = 256

@@ -7,88 +7,22 @@ of each, and the probability that a region is free of all is the product over *o
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from perception.hypotheses import FrameName, Hypotheses, binary_entropy
+from perception.region import Cells, Points, Region, Swept
 from probnerf.occupancy import voxel_centres
 from probnerf.types import BASE_Z
 
 # Weight of "all that was not seen is occupied" beside the hypotheses of an object that its prior cannot explain.
 CAUTION = 0.5
-REACH = 1e6  # m from the frame's origin that a region may lie: beyond, sizes and volumes overflow
 MAX_SAMPLES = 200_000  # lattice of a box that the unseen and outside fractions are counted on
 SWEPT_SAMPLES = 20_000  # the same of swept boxes, each of which is compared with all before it
 SLAB = 1_000_000  # samples of a box that are in memory at a time
 JOINT_DRAWS = 4096  # of the scene's volume, where there are several objects
-
-
-@dataclass(frozen=True)
-class Box:
-    """An axis-aligned box in the frame of the question, metres."""
-
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-
-    def __post_init__(self) -> None:
-        if not np.all(np.abs([self.low, self.high]) <= REACH):  # a NaN is not
-            raise ValueError(
-                f"the box {[*self.low, *self.high]} has a number that is not finite, or beyond {REACH:g}; "
-                "give six, in metres"
-            )
-        for axis, low, high in zip("xyz", self.low, self.high, strict=True):
-            if not low < high:
-                raise ValueError(
-                    f"the box is empty: {axis}1 = {high:g} is not greater than {axis}0 = {low:g}; "
-                    "give x0 y0 z0 x1 y1 z1 in metres"
-                )
-
-
-@dataclass(frozen=True, eq=False)
-class Points:
-    """N >= 1 points in the frame of the question, metres."""
-
-    points: Float[np.ndarray, "N 3"]
-
-    def __post_init__(self) -> None:
-        if self.points.ndim != 2 or self.points.shape[1] != 3 or not len(self.points):
-            raise ValueError(f"points have shape {list(self.points.shape)}; give [N, 3] with N >= 1, in metres")
-        if not (near := np.all(np.abs(self.points) <= REACH, axis=1)).all():
-            row = int(np.flatnonzero(~near)[0])
-            raise ValueError(f"point {row + 1} is {self.points[row].tolist()}; give numbers up to {REACH:g}, in metres")
-
-
-@dataclass(frozen=True, eq=False)
-class Swept:
-    """The union of N >= 1 boxes that may be turned, such as what a gripper sweeps.
-
-    A box thinner than a voxel of the object that it meets counts as one voxel thick.
-    """
-
-    T_frame_box: Float[np.ndarray, "N 4 4"]  # p_frame = T_frame_box @ p_box; the box's middle is its origin, metres
-    size: Float[np.ndarray, "N 3"]  # lengths of its edges, metres
-
-    def __post_init__(self) -> None:
-        T, size = self.T_frame_box, self.size
-        if T.ndim != 3 or T.shape[1:] != (4, 4) or not len(T) or size.shape != (len(T), 3):
-            raise ValueError(
-                f"boxes have poses {list(T.shape)} and sizes {list(size.shape)}; give [N, 4, 4] and [N, 3]"
-            )
-        if not ((np.abs(T) <= REACH).all() and ((size > 0) & (size <= REACH)).all()):
-            raise ValueError(f"a box's pose is not finite, an edge is not longer than 0 m, or beyond {REACH:g} m")
-
-    def holds(self, box: int, *axes: Float[np.ndarray, "..."], thicker: float = 0.0) -> Bool[np.ndarray, "..."]:
-        """Whether points, given by coordinates that broadcast, lie in a box whose edges are at least `thicker` long."""
-        T, half = np.linalg.inv(self.T_frame_box[box])[:3], 0.5 * np.maximum(self.size[box], thicker)
-        inside = np.ones((), bool)
-        for (a, b, c, d), h in zip(T, half, strict=True):
-            inside = inside & (np.abs(a * axes[0] + b * axes[1] + (c * axes[2] + d)) <= h)
-        return inside
-
-
-Region = Box | Points | Swept
 
 
 @dataclass(frozen=True)
@@ -106,9 +40,12 @@ class QueryResult:
     entropy_nats: float  # mean over the region's voxels of the binary entropy of p_occupied; 0 where it has no voxels
     effective_hypotheses: float  # distinct weighted hypotheses behind the answer; of several objects, the fewest
     age_s: float  # since the (oldest) frame's stamp
+    # by object id: which of its hypotheses (rows of its file) have something in the region, where some have: those
+    # disagree with the rest
+    blocked_by: dict[int, list[int]] = field(default_factory=dict)
     p_occupied: list[float] | None = None  # of each point; None for a box
 
-    def as_dict(self) -> dict[str, float | dict[str, float] | list[float]]:
+    def as_dict(self) -> dict[str, float | dict[str, float] | dict[int, list[int]] | list[float]]:
         """The fields by name, ready for JSON, without `p_occupied` where it is None."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
@@ -122,12 +59,16 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
     _check_scene(scene, frame)
     touched = []  # objects that have voxels in the region
     p_free, p_free_se, p_free_few, volumes, entropies = [], [], [], [], []
+    blocked_by: dict[int, list[int]] = {}
     for h in scene:
         index, volume = _region_voxels(h, region, frame)
         if not len(index):
             continue
         occupied = h.solid.reshape(len(h.weights), -1).take(index, axis=1)
-        free, se = h.estimate(~np.asarray(occupied.any(axis=1)))
+        blocked = np.asarray(occupied.any(axis=1))
+        if blocked.any():
+            blocked_by[h.object_id] = np.flatnonzero(blocked).tolist()
+        free, se = h.estimate(~blocked)
         weights, filled = h.weights, np.array([volume[row].sum() for row in occupied])
         if h.out_of_model:
             hidden = _hidden(h)[index]
@@ -153,6 +94,7 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
         entropy_nats=float(np.mean(np.concatenate(entropies))) if entropies else 0.0,
         effective_hypotheses=min(h.effective_hypotheses for h in touched or scene),
         age_s=((time.time_ns() if now_ns is None else now_ns) - min(h.stamp_ns for h in scene)) * 1e-9,
+        blocked_by=blocked_by,
         p_occupied=_p_occupied(scene, region, frame) if isinstance(region, Points) else None,
     )
 
@@ -192,13 +134,16 @@ def _region_voxels(
 
     A box, cut to the cube, is sampled on a lattice half a voxel wide or finer, at least one sample per axis, so that a
     thin box still finds its voxels. Points stand for the voxels they fall in. Of swept boxes, each eighth of a voxel
-    counts whose centre lies in one.
+    counts whose centre lies in one; cells wider than that are cut into such as are not.
     """
     hits = np.zeros(h.grid**3, int)
-    if isinstance(region, Points):
-        hits += _count(h.voxels(frame, *region.points.T), h)
+    if isinstance(region, Points | Cells):
+        points = region.points if isinstance(region, Points) else _finer(region, 0.5 * h.voxel_m)
+        hits += _count(h.voxels(frame, *points.T), h)
         index = np.flatnonzero(hits)
-        return index, np.full(len(index), h.voxel_m**3)
+        if isinstance(region, Points):
+            return index, np.full(len(index), h.voxel_m**3)
+        return index, hits[index] * (region.width**3 * len(region.centres) / len(points))
     T = np.linalg.inv(h.T_object_from(frame))
     if isinstance(region, Swept):
         filled = _filled(h, region, np.linalg.inv(T) @ region.T_frame_box)
@@ -235,6 +180,14 @@ def _filled(h: Hypotheses, region: Swept, T_object_box: Float[np.ndarray, "N 4 4
     return inside.reshape(h.grid, 2, h.grid, 2, h.grid, 2).sum(axis=(1, 3, 5)).ravel()
 
 
+def _finer(region: Cells, width: float) -> Float[np.ndarray, "n 3"]:
+    """Centres of the cells, each cut into as many equal ones as make them `width` wide at most."""
+    parts = int(np.ceil(region.width / width * (1 - 1e-9)))
+    steps = ((np.arange(parts) + 0.5) / parts - 0.5) * region.width
+    offsets = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    return (region.centres[:, None] + offsets).reshape(-1, 3)
+
+
 def _count(index: Int[np.ndarray, "..."], h: Hypotheses) -> Int[np.ndarray, "V"]:
     return np.bincount(index[index >= 0], minlength=h.grid**3)
 
@@ -253,8 +206,8 @@ def _fractions(scene: Sequence[Hypotheses], region: Region, frame: FrameName) ->
     The table's height may err by a voxel.
     """
     share = np.ones(())
-    if isinstance(region, Points):
-        x, y, z = region.points.T
+    if isinstance(region, Points | Cells):
+        x, y, z = region.points.T if isinstance(region, Points) else region.centres.T
     elif isinstance(region, Swept):
         (x, y, z), share = _sampled(region, 0.5 * min(h.voxel_m for h in scene))
     else:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from perception.query import Points
+from perception.region import Points
 
 
 def read_points(path: str | Path) -> Points:

@@ -57,7 +57,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "zenoh": ("node/bus.py",),
     "viser": ("node/page.py",),
     "tyro": ("node/__main__.py", "node/options.py", "benchmarks/*", "examples/*"),
-    "trimesh": ("benchmarks/mesh.py",),
+    "trimesh": ("perception/region.py", "benchmarks/mesh.py"),
     "rich": ("node/*", "benchmarks/*"),
     "matplotlib": ("node/plot*.py", "benchmarks/*"),
 }

@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import trimesh
 
 import node.pipeline
 from node.__main__ import COMMANDS, main
@@ -222,11 +223,12 @@ def test_a_bad_frame_folder_is_named(
         (["query", "none.npz", *BOX], "none.npz: no such file; `farside replay` writes"),
         (["query", "{text}", *BOX], "notes.txt is not a hypotheses file"),
         (["query", "{table}", *BOX], "table holds no object_<id>.npz"),
-        (["query", "{mug}"], "needs either --box X0 Y0 Z0 X1 Y1 Z1 or --points FILE.xyz"),
-        (["query", "{mug}", *BOX, "--points", "p.xyz"], "needs either --box"),
+        (["query", "{mug}"], "needs one of --box X0 Y0 Z0 X1 Y1 Z1, --points FILE.xyz and --mesh"),
+        (["query", "{mug}", *BOX, "--points", "p.xyz"], "needs one of --box"),
         (["query", "{mug}", "--box", "0", "0", "0", "1", "-1", "1"], "the box is empty: y1 = -1 is not greater"),
         (["query", "{mug}", *BOX, "--risk", "0.6"], "risk is 0.6; give the chance of being wrong"),
         (["query", "{mug}", "--points", "p.xyz"], "p.xyz: no such file; give a text file"),
+        (["query", "{mug}", "--mesh", "{text}"], "notes.txt cannot be read as a mesh"),
         (["query", "{mug}", *BOX, "--frame", "world"], "without the camera's pose in the world"),
         (["view", "{text}"], "notes.txt is not a hypotheses file"),
         (["view", "{mug}", "--port", "70000"], "port 70000 does not exist; give one of 0 to 65535"),
@@ -331,6 +333,12 @@ def test_query_answers_in_json_and_in_words(tmp_path: Path, frame: Frame, capsys
     assert main(["query", str(tmp_path), "--points", str(points), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["p_occupied"] == [pytest.approx(1.0), 0.0] and answer["outside_fraction"] == 0.5
+    floor = trimesh.creation.box((0.01, 0.01, 0.01))
+    floor.apply_translation([0.0, 0.0, low])
+    floor.export(tmp_path / "floor.stl")
+    assert main(["query", str(tmp_path), "--mesh", str(tmp_path / "floor.stl"), "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["p_free"] == 0.0 and set(answer["blocked_by"]) == {"1"}
     assert main(["query", str(path), "--points", str(points), "--frame", "camera"]) == 0
     said = capsys.readouterr().out
     assert "verdict at a risk of 0.05" in said and "all of it is free" in said

@@ -8,7 +8,8 @@ import pytest
 from node import panel, scene3d
 from node.shade import STATUS
 from perception.hypotheses import Hypotheses, mesh
-from perception.query import Box, Points, query
+from perception.query import query
+from perception.region import Box, Points
 from perception.segment import segment
 from perception.source import Frame
 from probnerf.types import BASE_Z, OBJECT

@@ -15,7 +15,8 @@ from node.bus_config import BusConfig
 from node.message import NEXT_VIEW, QUERY_REGION, header, make, matrix, pose
 from node.parameters import flat, serve_parameters
 from node.serve import BOX, POINTS, SWEPT, Answers
-from perception.query import Box, Points, query
+from perception.query import query
+from perception.region import Box, Points
 from tests.node.shapes import BODY, LEFT, RIGHT, STAMP_NS, body_with_handle
 
 

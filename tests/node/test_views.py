@@ -21,7 +21,8 @@ from node.views import (
     uncertainty,
     uncertainty_message,
 )
-from perception.query import Points, query
+from perception.query import query
+from perception.region import Points
 from tests.node.shapes import BODY, GRID, HALF_EXTENT, LEFT, RIGHT, STAMP_NS, body_with_handle
 
 CAMERA = Camera(160, 120, np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]), np.zeros(5))

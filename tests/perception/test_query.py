@@ -7,7 +7,8 @@ import pytest
 
 from perception.hypotheses import Hypotheses
 from perception.observe import ObjectFrame
-from perception.query import CAUTION, Box, Points, Swept, query
+from perception.query import CAUTION, query
+from perception.region import Box, Points, Swept
 from perception.xyz import read_points
 from probnerf.occupancy import voxel_centres
 
@@ -203,6 +204,7 @@ def test_the_answer_has_the_promised_keys(mug):
         "entropy_nats",
         "effective_hypotheses",
         "age_s",
+        "blocked_by",
     }
     assert query([mug], Box(*LEFT), "object").as_dict().keys() == keys
     points = query([mug], Points(np.zeros((3, 3))), "object").as_dict()

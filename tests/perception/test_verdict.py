@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from perception.query import Box, QueryResult, query
+from perception.query import QueryResult, query
+from perception.region import Box
 from perception.verdict import verdict
 from tests.perception.test_query import BODY, _fill, _object
 

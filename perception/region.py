@@ -1,0 +1,115 @@
+"""Regions that a planner may ask about, metres, in the frame of the question."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+REACH = 1e6  # m from the frame's origin that a region may lie: beyond, sizes and volumes overflow
+MOST_CELLS = 20_000_000  # of the box about a mesh
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box in the frame of the question, metres."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        if not np.all(np.abs([self.low, self.high]) <= REACH):  # a NaN is not
+            raise ValueError(
+                f"the box {[*self.low, *self.high]} has a number that is not finite, or beyond {REACH:g}; "
+                "give six, in metres"
+            )
+        for axis, low, high in zip("xyz", self.low, self.high, strict=True):
+            if not low < high:
+                raise ValueError(
+                    f"the box is empty: {axis}1 = {high:g} is not greater than {axis}0 = {low:g}; "
+                    "give x0 y0 z0 x1 y1 z1 in metres"
+                )
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """N >= 1 points in the frame of the question, metres."""
+
+    points: Float[np.ndarray, "N 3"]
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 3 or not len(self.points):
+            raise ValueError(f"points have shape {list(self.points.shape)}; give [N, 3] with N >= 1, in metres")
+        if not (near := np.all(np.abs(self.points) <= REACH, axis=1)).all():
+            row = int(np.flatnonzero(~near)[0])
+            raise ValueError(f"point {row + 1} is {self.points[row].tolist()}; give numbers up to {REACH:g}, in metres")
+
+
+@dataclass(frozen=True, eq=False)
+class Swept:
+    """The union of N >= 1 boxes that may be turned, such as what a gripper sweeps.
+
+    A box thinner than a voxel of the object that it meets counts as one voxel thick.
+    """
+
+    T_frame_box: Float[np.ndarray, "N 4 4"]  # p_frame = T_frame_box @ p_box; the box's middle is its origin, metres
+    size: Float[np.ndarray, "N 3"]  # lengths of its edges, metres
+
+    def __post_init__(self) -> None:
+        T, size = self.T_frame_box, self.size
+        if T.ndim != 3 or T.shape[1:] != (4, 4) or not len(T) or size.shape != (len(T), 3):
+            raise ValueError(
+                f"boxes have poses {list(T.shape)} and sizes {list(size.shape)}; give [N, 4, 4] and [N, 3]"
+            )
+        if not ((np.abs(T) <= REACH).all() and ((size > 0) & (size <= REACH)).all()):
+            raise ValueError(f"a box's pose is not finite, an edge is not longer than 0 m, or beyond {REACH:g} m")
+
+    def holds(self, box: int, *axes: Float[np.ndarray, "..."], thicker: float = 0.0) -> Bool[np.ndarray, "..."]:
+        """Whether points, given by coordinates that broadcast, lie in a box whose edges are at least `thicker` long."""
+        T, half = np.linalg.inv(self.T_frame_box[box])[:3], 0.5 * np.maximum(self.size[box], thicker)
+        inside = np.ones((), bool)
+        for (a, b, c, d), h in zip(T, half, strict=True):
+            inside = inside & (np.abs(a * axes[0] + b * axes[1] + (c * axes[2] + d)) <= h)
+        return inside
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """The union of N >= 1 cubes of one size on a lattice, such as a mesh fills (`read_mesh`)."""
+
+    centres: Float[np.ndarray, "N 3"]  # in the frame of the question, metres
+    width: float  # of a cube, metres
+
+    def __post_init__(self) -> None:
+        Points(self.centres)
+        if not 0 < self.width <= REACH:
+            raise ValueError(f"cells are {self.width:g} m wide; give more than 0 and up to {REACH:g}")
+
+
+Region = Box | Points | Swept | Cells
+
+
+def read_mesh(path: Path, width: float) -> Cells:
+    """What a mesh file (.obj, .stl, .ply, .off, .glb; metres) fills, in its own frame: cells that its surface meets or
+    encloses. A surface with an opening wider than a cell encloses nothing there.
+
+    Raises FileNotFoundError, or ValueError where the file holds no triangles or would fill more than `MOST_CELLS`.
+    """
+    import trimesh
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; give a mesh (.obj, .stl, .ply, .off or .glb, in metres)")
+    try:
+        mesh = trimesh.load_mesh(path)
+    except Exception as error:  # whatever a reader of one of its formats meets
+        raise ValueError(f"{path} cannot be read as a mesh: {error}") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
+        raise ValueError(f"{path} holds no triangles, or numbers that are none")
+    cells = float(np.prod(np.ceil(mesh.extents / width) + 1))
+    if cells > MOST_CELLS:
+        size = " x ".join(f"{e:g}" for e in mesh.extents)
+        raise ValueError(
+            f"{path} is {size} m large: too large to be filled with cells of {width:g} m; is it in metres?"
+        )
+    filled = mesh.voxelized(width).fill("holes")
+    return Cells(np.asarray(filled.points, np.float64), width)
