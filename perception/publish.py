@@ -55,7 +55,8 @@ def published(
     """A posterior as planners read it; `diagnostics` are added to the sampler's own."""
     chosen, weights, population = thin(posterior, config.hypotheses)
     sizeless = without_sizes(likelihood)
-    positions, pose_sigma = posterior.positions[jnp.asarray(chosen)], view.observation.pose_sigma
+    # NumPy: how many there are to choose from varies, and nothing may compile for it
+    positions, pose_sigma = jnp.asarray(np.asarray(posterior.positions)[chosen]), view.observation.pose_sigma
     fit = float(weights @ np.asarray(explained(prior.model, sizeless, view.observation, positions), np.float64))
     cube = view.object_frame
     if cube.sight_sigma > 0.0:  # what no pixel tells is not sampled: each sample draws it from its prior
@@ -91,7 +92,7 @@ def published(
             "r_hat": float(d.r_hat),
             "ess": float(d.ess),
             "ancestors": float(d.ancestors),
-            "beta": float(d.beta.min()),
+            "beta": float(np.min(d.beta)),
             "log_evidence": float(posterior.log_evidence),
             "log_evidence_se": float(posterior.log_evidence_se),
             "explained": fit,

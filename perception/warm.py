@@ -3,14 +3,18 @@
 import gc
 from dataclasses import replace
 
+import numpy as np
+
 from perception.log import Log
-from perception.segment import segment
+from perception.segment import Segment, segment
 from perception.source import SHIPPED_LOG
 from perception.track import Tracker
+from probnerf.types import FREE, UNKNOWN
 
 
 def warm_up(tracker: Tracker) -> None:
-    """Look at an object of the shipped recording with a tracker of the same prior and configuration.
+    """Look at an object of the shipped recording with a tracker of the same prior and configuration: as it is there,
+    half hidden, for which inference begins at the prior, and as if nothing stood before it, for which it climbs.
 
     Raises KeyboardInterrupt where Ctrl-C ended it, which the sampler may keep for itself.
 
@@ -18,13 +22,21 @@ def warm_up(tracker: Tracker) -> None:
     periods of a camera, so what is there by then is set aside from it.
     """
     frame = next(iter(Log(SHIPPED_LOG)))
-    trial = replace(tracker, _tracks={}, _names=set())
+    hidden = segment(frame)[0]
     try:
-        for _ in range(2):  # an answer that was cut short is gone on with
-            update = trial.update(frame, segment(frame)[0], stages=1, on_answer=lambda _: None)
-            if update.hypotheses.result == "interrupted":
-                raise KeyboardInterrupt
+        for seen in (_alone(hidden), hidden):
+            trial = replace(tracker, _tracks={}, _names=set())
+            for _ in range(2):  # an answer that was cut short is gone on with
+                update = trial.update(frame, seen, stages=1, on_answer=lambda _: None)
+                if update.hypotheses.result == "interrupted":
+                    raise KeyboardInterrupt
     except ValueError:  # a prior of other objects: its own first frame compiles
         pass
     gc.collect()
     gc.freeze()
+
+
+def _alone(segment: Segment) -> Segment:
+    """The segment as if all that was hidden of its surroundings had been seen empty."""
+    status = np.where(segment.status == UNKNOWN, FREE, segment.status).astype(segment.status.dtype)
+    return replace(segment, status=status, occluder=np.zeros_like(segment.occluder))

@@ -96,25 +96,32 @@ def pooled(posteriors: Sequence[Posterior], evidence_power: float) -> Posterior:
     spread = np.std(np.exp(estimates - log_evidence), ddof=1) / np.sqrt(len(estimates))
     by_population = values[np.argsort(population, kind="stable")].reshape(len(estimates), -1)
     every = [p.diagnostics for p in posteriors]
+
+    def summed(counts: Sequence[Array]) -> Array:
+        return jnp.asarray(np.sum(np.stack([np.asarray(c) for c in counts]), axis=0))
+
+    def joined(arrays: Sequence[Array]) -> Array:  # NumPy: the number of runs varies, and nothing may compile for it
+        return jnp.asarray(np.concatenate([np.asarray(a) for a in arrays]))
+
     return replace(
         posteriors[-1],
-        positions=jnp.concatenate([p.positions for p in posteriors]),
-        log_weights=jnp.asarray(log_weights, jnp.float32),
+        positions=joined([p.positions for p in posteriors]),
+        log_weights=jnp.asarray(log_weights.astype(np.float32)),
         log_likelihoods=jnp.asarray(values),
-        log_density=jnp.concatenate([p.log_density for p in posteriors]),
-        population=jnp.asarray(population, jnp.int32),
-        log_evidence=jnp.asarray(log_evidence, jnp.float32),
-        log_evidence_se=jnp.asarray(spread, jnp.float32),
+        log_density=joined([p.log_density for p in posteriors]),
+        population=jnp.asarray(population.astype(np.int32)),
+        log_evidence=jnp.asarray(np.float32(log_evidence)),
+        log_evidence_se=jnp.asarray(np.float32(spread)),
         diagnostics=replace(
             every[-1],
-            divergences=jnp.stack([d.divergences for d in every]).sum(),
-            r_hat=jnp.asarray(split_r_hat(by_population), jnp.float32),
-            ess=jnp.asarray(1.0 / np.sum(np.exp(2.0 * log_weights)), jnp.float32),
-            ancestors=jnp.stack([d.ancestors for d in every]).sum(),
-            stages=jnp.stack([d.stages for d in every]).sum(),
-            point_gradients=jnp.stack([d.point_gradients for d in every]).sum(),
-            beta=jnp.concatenate([d.beta for d in every]),
-            log_evidences=jnp.asarray(estimates, jnp.float32),
+            divergences=summed([d.divergences for d in every]),
+            r_hat=jnp.asarray(np.float32(split_r_hat(by_population))),
+            ess=jnp.asarray(np.float32(1.0 / np.sum(np.exp(2.0 * log_weights)))),
+            ancestors=summed([d.ancestors for d in every]),
+            stages=summed([d.stages for d in every]),
+            point_gradients=summed([d.point_gradients for d in every]),
+            beta=joined([d.beta for d in every]),
+            log_evidences=jnp.asarray(estimates.astype(np.float32)),
         ),
     )
 

@@ -7,10 +7,16 @@ from typing import Any
 import jax
 import pytest
 
+from benchmarks.occluded import carton_seeds, half_hidden
+from benchmarks.scene import vessel_view
+from benchmarks.unseen import any_view
 from perception.track import Tracker, Update
 from perception.warm import warm_up
+from probnerf import smc
+from probnerf.infer import explained, opacity_grids
+from probnerf.modes import mixture_of_modes
 from probnerf.prior import PRESETS, ProbNeRF
-from probnerf.store import Prior
+from probnerf.store import Prior, load_prior
 from tests.node.shapes import body_with_handle
 
 
@@ -38,7 +44,7 @@ def test_another_tracker_of_the_same_settings_looks_and_looks_again(
         assert gc.get_freeze_count() > before  # what is there is no longer looked through
     finally:
         gc.unfreeze()
-    assert len(asked) == 2 and asked[0] is asked[1]
+    assert len(asked) == 4 and asked[0] is asked[1] and asked[2] is asked[3] and asked[0] is not asked[2]
     for trial in asked:
         assert trial is not tracker and trial.prior is tracker.prior and trial.seed == 3
         assert trial.config == tracker.config
@@ -58,3 +64,28 @@ def test_a_prior_of_other_objects_is_no_error(monkeypatch: pytest.MonkeyPatch) -
     finally:
         gc.unfreeze()
     assert len(asked) == 1
+
+
+@pytest.mark.slow
+def test_nothing_large_is_left_for_the_first_frame_to_compile() -> None:
+    """Of an object seen well and of one half hidden, neither of which is in the recording."""
+    tracker = Tracker(load_prior())
+    try:
+        warm_up(tracker)
+    finally:
+        gc.unfreeze()
+    programs: tuple[Any, ...] = (
+        smc._start,
+        smc._stage,
+        smc._reference_start,
+        mixture_of_modes,
+        opacity_grids,
+        explained,
+    )
+    before = [f._cache_size() for f in programs]
+    for picture in (any_view(2_000_001), half_hidden(2_000_003, next(carton_seeds(range(2_000_004, 2_000_999))))):
+        assert picture is not None
+        view = vessel_view(picture)
+        tracker = Tracker(load_prior())
+        tracker.update(view.frame, view.segment, stages=3, on_answer=lambda _: None)
+        assert [f._cache_size() for f in programs] == before
