@@ -56,7 +56,7 @@ def published(
     chosen, weights, population = thin(posterior, config.hypotheses)
     sizeless = without_sizes(likelihood)
     # NumPy: how many there are to choose from varies, and nothing may compile for it
-    positions, pose_sigma = jnp.asarray(np.asarray(posterior.positions)[chosen]), view.observation.pose_sigma
+    positions, pose_sigma = jax.device_put(np.asarray(posterior.positions)[chosen]), view.observation.pose_sigma
     fit = float(weights @ np.asarray(explained(prior.model, sizeless, view.observation, positions), np.float64))
     cube = view.object_frame
     if cube.sight_sigma > 0.0:  # what no pixel tells is not sampled: each sample draws it from its prior
@@ -65,7 +65,7 @@ def published(
         camera = jnp.asarray(cube.to_cube(np.zeros(3)), jnp.float32)
         positions = scaled_about(prior.model, positions, pose_sigma, camera, drawn[jnp.asarray(chosen)])
     asked = answered_voxels(view.frame, view.segment, cube, config.grid)
-    opacity = opacity_grids(prior.model, sizeless, positions, pose_sigma, jnp.asarray(asked))
+    opacity = opacity_grids(prior.model, sizeless, positions, pose_sigma, jax.device_put(asked))
     pose = poses(prior.model, sizeless, positions, pose_sigma)
     d = posterior.diagnostics
     draft = Hypotheses(

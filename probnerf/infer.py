@@ -239,9 +239,9 @@ def encoder_guess(
     each = np.exp(values - top).reshape(yaws, draws).mean(axis=1) if np.isfinite(top) else np.ones(yaws)
     with np.errstate(divide="ignore"):
         log_weights = np.log(np.repeat(each / each.sum() / draws, draws))
-    nan, zero = jnp.asarray(np.float32("nan")), jnp.asarray(np.int32(0))
-    nans, none = jnp.full(len(values), nan), jnp.asarray(np.float32(0.0))
-    ess = jnp.asarray(np.float32(1.0 / np.sum(np.exp(2.0 * log_weights))))
+    nan, zero = jax.device_put(np.float32("nan")), jax.device_put(np.int32(0))
+    nans, none = jnp.full(len(values), nan), jax.device_put(np.float32(0.0))
+    ess = jax.device_put(np.float32(1.0 / np.sum(np.exp(2.0 * log_weights))))
     diagnostics = Diagnostics(nan, zero, nan, ess, zero, zero, none, jnp.zeros(1), jnp.full(1, nan))
     likelihoods, population = jnp.asarray(values, jnp.float32), jnp.zeros(len(values), jnp.int32)
     weights = jnp.asarray(log_weights, jnp.float32)

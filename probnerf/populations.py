@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -62,18 +63,18 @@ def gathered(
     with np.errstate(invalid="ignore"):  # no likelihood anywhere
         log_density = log_normal + f - log_evidences[:, None]
     return Posterior(
-        positions=jnp.asarray(positions.reshape(-1, positions.shape[-1])),
-        log_weights=jnp.asarray(log_weights.astype(np.float32)),
-        log_likelihoods=jnp.asarray(values.ravel()),
-        log_density=jnp.asarray(log_density.astype(np.float32).ravel()),
-        population=jnp.asarray(population),
-        log_evidence=jnp.asarray(np.float32(log_evidence)),
-        log_evidence_se=jnp.asarray(np.float32(error)),
+        positions=jax.device_put(positions.reshape(-1, positions.shape[-1])),
+        log_weights=jax.device_put(log_weights.astype(np.float32)),
+        log_likelihoods=jax.device_put(values.ravel()),
+        log_density=jax.device_put(log_density.astype(np.float32).ravel()),
+        population=jax.device_put(population),
+        log_evidence=jax.device_put(np.float32(log_evidence)),
+        log_evidence_se=jax.device_put(np.float32(error)),
         diagnostics=Diagnostics(
-            r_hat=jnp.asarray(np.float32(split_r_hat(values.swapaxes(0, 1).reshape(populations, -1)))),
-            ess=jnp.asarray(np.float32(1.0 / np.sum(np.exp(2.0 * log_weights)))),
-            beta=jnp.asarray(beta, jnp.float32),
-            log_evidences=jnp.asarray(log_evidences, jnp.float32),
+            r_hat=jax.device_put(np.float32(split_r_hat(values.swapaxes(0, 1).reshape(populations, -1)))),
+            ess=jax.device_put(np.float32(1.0 / np.sum(np.exp(2.0 * log_weights)))),
+            beta=jax.device_put(np.asarray(beta, np.float32)),
+            log_evidences=jax.device_put(np.asarray(log_evidences, np.float32)),
             **told,
         ),
         result=result,
@@ -98,30 +99,30 @@ def pooled(posteriors: Sequence[Posterior], evidence_power: float) -> Posterior:
     every = [p.diagnostics for p in posteriors]
 
     def summed(counts: Sequence[Array]) -> Array:
-        return jnp.asarray(np.sum(np.stack([np.asarray(c) for c in counts]), axis=0))
+        return jax.device_put(np.sum(np.stack([np.asarray(c) for c in counts]), axis=0))
 
     def joined(arrays: Sequence[Array]) -> Array:  # NumPy: the number of runs varies, and nothing may compile for it
-        return jnp.asarray(np.concatenate([np.asarray(a) for a in arrays]))
+        return jax.device_put(np.concatenate([np.asarray(a) for a in arrays]))
 
     return replace(
         posteriors[-1],
         positions=joined([p.positions for p in posteriors]),
-        log_weights=jnp.asarray(log_weights.astype(np.float32)),
-        log_likelihoods=jnp.asarray(values),
+        log_weights=jax.device_put(log_weights.astype(np.float32)),
+        log_likelihoods=jax.device_put(values),
         log_density=joined([p.log_density for p in posteriors]),
-        population=jnp.asarray(population.astype(np.int32)),
-        log_evidence=jnp.asarray(np.float32(log_evidence)),
-        log_evidence_se=jnp.asarray(np.float32(spread)),
+        population=jax.device_put(population.astype(np.int32)),
+        log_evidence=jax.device_put(np.float32(log_evidence)),
+        log_evidence_se=jax.device_put(np.float32(spread)),
         diagnostics=replace(
             every[-1],
             divergences=summed([d.divergences for d in every]),
-            r_hat=jnp.asarray(np.float32(split_r_hat(by_population))),
-            ess=jnp.asarray(np.float32(1.0 / np.sum(np.exp(2.0 * log_weights)))),
+            r_hat=jax.device_put(np.float32(split_r_hat(by_population))),
+            ess=jax.device_put(np.float32(1.0 / np.sum(np.exp(2.0 * log_weights)))),
             ancestors=summed([d.ancestors for d in every]),
             stages=summed([d.stages for d in every]),
             point_gradients=summed([d.point_gradients for d in every]),
             beta=joined([d.beta for d in every]),
-            log_evidences=jnp.asarray(estimates.astype(np.float32)),
+            log_evidences=jax.device_put(estimates.astype(np.float32)),
         ),
     )
 

@@ -260,11 +260,11 @@ def tempered_smc(
     def samples(result: str = "underway") -> Posterior:
         chains = kept or [state.chain]
         told = {
-            "acceptance": jnp.asarray(np.float32(acceptance)),
-            "divergences": jnp.asarray(np.int32(divergences)),
-            "ancestors": jnp.asarray(np.int32(sum(len(np.unique(row)) for row in np.asarray(state.ancestor)))),
-            "stages": jnp.asarray(np.int32(done)),
-            "point_gradients": jnp.asarray(np.float32(gradients)),
+            "acceptance": jax.device_put(np.float32(acceptance)),
+            "divergences": jax.device_put(np.int32(divergences)),
+            "ancestors": jax.device_put(np.int32(sum(len(np.unique(row)) for row in np.asarray(state.ancestor)))),
+            "stages": jax.device_put(np.int32(done)),
+            "point_gradients": jax.device_put(np.float32(gradients)),
         }
         beta, evidence, variance = (np.asarray(a, np.float64) for a in (state.beta, state.log_evidence, state.variance))
         return gathered(chains[-config.keep :], beta, evidence, variance, config.evidence_power, told, result)

@@ -60,7 +60,8 @@ def load_prior(path: Path | None = None, preset: str | None = None) -> Prior:
         raise ValueError(f"{path} is not a prior of format {FORMAT} with a preset of {', '.join(PRESETS)}")
     if preset is not None and story["preset"] != preset:
         raise ValueError(f"{path} holds preset '{story['preset']}', not '{preset}'; give weights of that preset")
-    model = ProbNeRF(PRESETS[story["preset"]], jax.random.key(0))
+    # shapes alone: to draw weights that are thrown away takes seconds
+    model = jax.eval_shape(lambda key: ProbNeRF(PRESETS[story["preset"]], key), jax.random.key(0))
     named = _named(model)
     for name, leaf in named.items():
         found = arrays.get(name)
@@ -69,6 +70,6 @@ def load_prior(path: Path | None = None, preset: str | None = None) -> Prior:
             raise ValueError(
                 f"{path}: array {name} is {shape}, preset '{story['preset']}' needs {list(leaf.shape)}; train it again"
             )
-    leaves = [jax.numpy.asarray(arrays[name]) for name in named]
+    leaves = jax.device_put([arrays[name] for name in named])
     model = jax.tree.unflatten(jax.tree.structure(model), leaves)
     return Prior(model, story, hashlib.sha256(path.read_bytes()).hexdigest()[:16])
