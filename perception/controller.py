@@ -231,7 +231,7 @@ class _Work:
     @cached_property
     def picture(self) -> Picture | None:
         """What the encoder sees. It was trained on objects with ranges; without, sampling begins at the prior."""
-        if self.view.frame.depth is None:
+        if self.view.frame.depth is None or not isinstance(self.prior.model, ProbNeRF):
             return None
         return crop(self.view.frame, self.view.segment, self.view.object_frame, self.prior.model.preset.image_size)
 
