@@ -168,7 +168,9 @@ def _settings(config: ControllerConfig, rivals: RivalConfig, quick: bool) -> dic
         text = json.dumps(told, sort_keys=True, default=str)
         return {"digest": sha256(text.encode()).hexdigest()[:12] + "-quick" * quick}  # a base rate of fewer objects
 
-    own = {m: digest(asdict(config)) if m == POSTERIOR else digest(shared, asdict(rivals)) for m in METHODS}
+    sampler = asdict(config)
+    del sampler["out_of_model_below"]  # what is judged here are the hypotheses, flagged or not
+    own = {m: digest(sampler) if m == POSTERIOR else digest(shared, asdict(rivals)) for m in METHODS}
     return {**own, **{m: settings_of(method, config) for m, method in SLOW.items()}}
 
 

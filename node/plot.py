@@ -188,7 +188,7 @@ def _write_summary(ax: Axes, h: Hypotheses) -> None:
         ax.text(0.03, 0.95 - 0.08 * i, name, fontsize=9, color="#666666", transform=ax.transAxes)
         ax.text(0.36, 0.95 - 0.08 * i, value, fontsize=9, transform=ax.transAxes)
     doubts = "\n".join(textwrap.fill(line, 44) for line in warnings(h))
-    ax.text(0.03, 0.36, doubts, va="top", fontsize=9, color="#b03020", transform=ax.transAxes)
+    ax.text(0.03, 0.41, doubts, va="top", fontsize=9, color="#b03020", transform=ax.transAxes)
     unseen = (
         "surface not measured, or out of its sight" if h.object_frame.sight_sigma > 0 else "surface out of its sight"
     )
@@ -196,7 +196,7 @@ def _write_summary(ax: Axes, h: Hypotheses) -> None:
         Patch(color=tuple(shade.SEEN), label="surface that the camera saw"),
         Patch(color=tuple(shade.UNSEEN), label=unseen),
     ]
-    ax.legend(handles=handles, loc="lower left", fontsize=9.5, frameon=False)
+    ax.legend(handles=handles, loc="lower left", fontsize=9, frameon=False, borderpad=0.0)
 
 
 def _smoothed(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
