@@ -18,8 +18,9 @@ Answers are appended to a file as they come, and what is there is not made again
 """
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -37,10 +38,11 @@ from benchmarks.score import BOXES, Answer, as_queried, random_boxes, score
 from benchmarks.summary import mean_rows, say, table
 from benchmarks.unseen import any_view
 from perception.controller import ControllerConfig, estimate
+from perception.source import Frame
 from probnerf.families.tabletop import TEST_SEEDS
 from probnerf.metrics import falsely_free, scored_voxels
 from probnerf.occupancy import coarsen
-from probnerf.store import load_prior
+from probnerf.store import Prior, load_prior
 from probnerf.types import UNKNOWN
 
 RESULTS = Path(__file__).with_suffix(".jsonl")
@@ -102,23 +104,25 @@ def main(
     return rows
 
 
-def _views(n: int, noise: int, meshes: Path) -> Iterator[tuple[str, Any, Any]]:
+def _views(n: int, noise: int, meshes: Path) -> Iterator[tuple[str, int | str, Callable[[], VesselView]]]:
     """(condition, object, a function that makes its view or raises ValueError)."""
     files = sorted(meshes.rglob("*.obj"))
     if not files:
         raise ValueError(f"no mesh (*.obj) under {meshes}: name a folder that holds some with --meshes")
-    for i in range(n):
-        number = TEST_SEEDS[FIRST + i]
-        yield FAMILY, number, lambda number=number: vessel_view(any_view(number))
+    for number in TEST_SEEDS[FIRST : FIRST + n]:
+        yield FAMILY, number, partial(_of_family, number)
     for i, path in enumerate(files[:n]):
-        yield STRANGERS, str(path.relative_to(meshes)), lambda i=i, path=path: mesh_view(path, i)
-    for i in range(noise):
-        number = TEST_SEEDS[FIRST + 500 + i]
-        yield NOISE, number, lambda number=number: vessel_view(any_view(number), fault=lambda f: noise_frame(f, 1.0))
+        yield STRANGERS, str(path.relative_to(meshes)), partial(mesh_view, path, i)
+    for number in TEST_SEEDS[FIRST + 500 : FIRST + 500 + noise]:
+        yield NOISE, number, partial(_of_family, number, lambda frame: noise_frame(frame, 1.0))
+
+
+def _of_family(number: int, fault: Callable[[Frame], Frame] | None = None) -> VesselView:
+    return vessel_view(any_view(number), fault=fault)
 
 
 def _answered(
-    view: VesselView, prior: Any, config: ControllerConfig, rate: Float[np.ndarray, "32 32 32"], seed: int
+    view: VesselView, prior: Prior, config: ControllerConfig, rate: Float[np.ndarray, "32 32 32"], seed: int
 ) -> dict[str, Any]:
     """What is kept of one answer: the checks, and boxes before and after caution. ValueError: nothing to score."""
     found = estimate(view.frame, view.segment, prior, config, seed=seed, stages=240)

@@ -44,6 +44,7 @@ def frame_of(yaw: float) -> Frame:
     handle = trimesh.creation.box(size)
     handle.apply_translation([RADIUS + 0.5 * HANDLE, 0.0, 0.0])
     mesh = trimesh.util.concatenate([body, handle])
+    assert isinstance(mesh, trimesh.Trimesh)
     mesh.apply_translation([0.0, 0.0, 0.5 * field.height])
     mesh.apply_scale(HALF_EXTENT)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(yaw, [0, 0, 1]))
