@@ -306,7 +306,7 @@ def test_a_worse_calibration_gives_a_less_certain_posterior() -> None:
     prior = load_prior(None)
     spread, doubt = [], []
     for share in (0.0, 0.1):
-        h = estimate(uncertain(frame, share), found, prior, stages=6).hypotheses
+        h = estimate(uncertain(frame, share), found, prior, stages=16).hypotheses
         log_scale = h.pose[:, 3]
         spread.append(float(np.sqrt(h.weights @ (log_scale - h.weights @ log_scale) ** 2)))
         p = np.tensordot(h.weights, h.solid, axes=1)
