@@ -111,7 +111,7 @@ def test_frames_of_a_mug_add_up_as_they_should() -> None:
     seen = tracker.update(side, segment(side)[0], stages=40)
     assert seen.change == "view" and seen.hypotheses.stamp_ns == 20
     assert on_handle(seen.hypotheses) > max(0.5, on_handle(begun.hypotheses) + 0.2)
-    assert uncertainty(seen.hypotheses) < uncertainty(begun.hypotheses)  # by a sixth here: the first was sure of no handle
+    assert uncertainty(seen.hypotheses) < uncertainty(begun.hypotheses)  # by a sixth: the first was sure of no handle
 
     # the mug is carried off by 6 cm
     moved = frame_from(0.0, replace(MUG, y=MUG.y + 0.06), stamp_ns=30)
