@@ -30,6 +30,8 @@ def answer(
     table = Table.grid(padding=(0, 2))
     for name, value in ((f"verdict at a risk of {risk:g}", said), *rows(result)):
         table.add_row(name, value)
+    for object_id, blocking in result.blocked_by.items():
+        table.add_row(f"not free in, object {object_id}", _numbers(blocking))
     out.print(table, highlight=False)
     for i, p in enumerate(result.p_occupied or [], start=1):
         out.print(f"  point {i}: occupied with probability {p:.3f}", highlight=False)
@@ -48,7 +50,6 @@ def rows(r: QueryResult) -> list[tuple[str, str]]:
         ),
         ("mean entropy", f"{r.entropy_nats:.3f} nats per voxel"),
         ("effective hypotheses", f"{r.effective_hypotheses:.1f}"),
-        *((f"not free in, object {o}", _numbers(rows)) for o, rows in r.blocked_by.items()),
     ]
 
 
