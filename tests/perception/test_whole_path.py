@@ -33,6 +33,7 @@ CONFIG = ControllerConfig(
     ),
     hypotheses=384,
     grid=32,
+    out_of_model_below=0.0,  # what is compared is the posterior, without a query's caution
 )
 
 
