@@ -56,7 +56,8 @@ class Question:
 
     @cached_property
     def observed(self) -> tuple[Observation, ObjectFrame]:
-        return observe(self.view.frame, self.view.segment, self.config.observe, self.seed, self.view.cube)
+        known = self.view.cube if self.view.pose_known else None  # otherwise finding it is part of the time
+        return observe(self.view.frame, self.view.segment, self.config.observe, self.seed, known)
 
     @property
     def key(self) -> Array:
