@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from threading import RLock
 
 import jax
 import jax.numpy as jnp
@@ -47,6 +48,9 @@ from probnerf.smc import TemperedSMCConfig
 from probnerf.store import Prior
 from probnerf.types import OBJECT, UNKNOWN, Observation, Posterior
 from probnerf.views import ENCODER_RADIUS
+
+# Two batches of eigenvalues may wait for each other for ever: each holds a thread of XLA's pool, one per core, until
+_ONE_AT_A_TIME = RLock()  # another thread of that pool has done its parts (jaxlib's ParallelBatchMap)
 
 
 @dataclass(frozen=True)
@@ -236,7 +240,11 @@ class _Work:
         return crop(self.view.frame, self.view.segment, self.view.object_frame, self.prior.model.preset.image_size)
 
     def sample(self, run: int) -> Posterior:
-        """One run of `infer`."""
+        """One run of `infer`; other threads' wait."""
+        with _ONE_AT_A_TIME:
+            return self._sampled(run)
+
+    def _sampled(self, run: int) -> Posterior:
         observation = self.view.observation
         key = jax.random.key(self.seed)
         if not self.searched and self.before is None:

@@ -1,5 +1,6 @@
 """The controller: what makes the model grow, what stops it, and that a cut leaves the answer before it standing."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from math import inf
 
@@ -101,3 +102,14 @@ def test_how_many_runs_an_error_takes(done: int, error: float, missed: float, ne
 def test_no_particles_are_refused() -> None:
     with pytest.raises(ValueError, match="particles 0"):
         ControllerConfig(particles=0)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_two_threads_ask_at_once_and_both_are_answered() -> None:
+    """With two cores the library of eigenvalues would wait for ever, each for the thread that the other holds."""
+    answers_of(CONFIG, stages=1)
+    with ThreadPoolExecutor(2) as threads:
+        found = [found for found, _ in threads.map(lambda _: answers_of(CONFIG, stages=20), range(4))]
+    for other in found[1:]:
+        np.testing.assert_array_equal(other.hypotheses.opacity, found[0].hypotheses.opacity)
