@@ -38,7 +38,7 @@ def _start(begun: float) -> dict[str, float]:
 
 def _started(cache: str) -> dict[str, float]:
     """`_start` in a new process that compiles into `cache`."""
-    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": cache}
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": cache, "FARSIDE_PROGRAMS": cache}
     command = [sys.executable, "-m", "benchmarks.startup", str(time.time())]
     run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if run.returncode != 0:

@@ -237,8 +237,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         _end(main(sys.argv[1:]))
     given = list(argv)
     args = [a for a in given if a != "--debug"]
-    # Compiled programs outlive the process. JAX reads these when it is first imported.
+    # Compiled programs outlive the process: the large ones by `probnerf.programs`, the small ones by JAX, which reads
+    # these when it is first imported.
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "farside"
+    os.environ.setdefault("FARSIDE_PROGRAMS", str(cache))
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     # Only what is fatal: jaxlib 0.10.1 takes its own kept programs for another machine's, at every start.

@@ -3,12 +3,14 @@
 import gc
 from dataclasses import replace
 
+import jax
 import numpy as np
 
 from perception.log import Log
 from perception.segment import Segment, segment
-from perception.source import SHIPPED_LOG
+from perception.source import SHIPPED_LOG, Frame
 from perception.track import Tracker
+from probnerf.infer import infer
 from probnerf.types import FREE, UNKNOWN
 
 
@@ -26,14 +28,22 @@ def warm_up(tracker: Tracker) -> None:
     try:
         for seen in (_alone(hidden), hidden):
             trial = replace(tracker, _tracks={}, _names=set())
-            for _ in range(2):  # an answer that was cut short is gone on with
-                update = trial.update(frame, seen, stages=1, on_answer=lambda _: None)
-                if update.hypotheses.result == "interrupted":
-                    raise KeyboardInterrupt
+            update = trial.update(frame, seen, stages=1, on_answer=lambda _: None)
+            if update.hypotheses.result == "interrupted":
+                raise KeyboardInterrupt
+            _go_on(trial, frame, seen)
     except ValueError:  # a prior of other objects: its own first frame compiles
         pass
     gc.collect()
     gc.freeze()
+
+
+def _go_on(trial: Tracker, frame: Frame, segment: Segment) -> None:
+    """What a next frame asks, and the sampler where the answer was cut short; to publish that needs nothing new."""
+    look = trial.look(frame, segment)
+    assert look is not None
+    before, observation = trial._tracks[look.object_id].posterior, look._view.observation
+    infer(jax.random.key(0), trial.prior.model, observation, trial.config.infer, before=before, stages=1)
 
 
 def _alone(segment: Segment) -> Segment:

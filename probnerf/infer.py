@@ -28,6 +28,7 @@ from probnerf.model import (
 from probnerf.modes import ModesConfig, mixture_of_modes
 from probnerf.populations import start_from
 from probnerf.prior import ProbNeRF
+from probnerf.programs import program
 from probnerf.proposal import Picture, encoder_positions, even_yaws, guesses
 from probnerf.smc import TemperedSMCConfig, tempered_smc
 from probnerf.types import BASE_Z, OBJECT, UNKNOWN, Diagnostics, Observation, Pose, Posterior
@@ -35,6 +36,7 @@ from probnerf.types import BASE_Z, OBJECT, UNKNOWN, Diagnostics, Observation, Po
 Method = Literal["tempered_smc", "annealed_hmc"]
 _NOWHERE = 50.0  # cube units, outside every window: the kernel passes such points over
 WALL_ERROR = 0.02  # cube units; how well the prior's shapes place a wall
+_log_likelihood = program()(log_likelihood)
 
 
 def quick_smc(populations: int, particles: int) -> TemperedSMCConfig:
@@ -233,7 +235,7 @@ def encoder_guess(
         yaws, draws = 1, yaws * draws
         positions = guesses(key, model, picture, draws, sample_pose=False)
     args = (model, likelihood, observation, faces_of_view(observation, likelihood))
-    values = np.asarray(jax.jit(log_likelihood)(args, positions), np.float64)
+    values = np.asarray(_log_likelihood(args, positions), np.float64)
     values = np.where(np.isfinite(values), values, -np.inf)
     top = values.max()
     each = np.exp(values - top).reshape(yaws, draws).mean(axis=1) if np.isfinite(top) else np.ones(yaws)
@@ -248,7 +250,7 @@ def encoder_guess(
     return Posterior(positions, weights, likelihoods, nans, population, nan, nan, diagnostics, "underway")
 
 
-@jax.jit
+@program()
 def opacity_grids(
     model: Model,
     likelihood: Likelihood,
@@ -280,6 +282,7 @@ def opacity_grids(
     return jax.lax.map(one, (positions, decoded))
 
 
+@program()
 def poses(model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "5"]) -> Pose:
     """Pose of each position (identity where the pose was known)."""
     if not likelihood.sample_pose:
@@ -309,7 +312,7 @@ def scaled_about(
     return positions.at[:, at : at + 5].add(moved / jnp.maximum(pose_sigma, 1e-9))
 
 
-@jax.jit
+@program()
 def explained(
     model: Model, likelihood: Likelihood, observation: Observation, positions: Float[Array, "s d"]
 ) -> Float[Array, "s"]:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, PyTree, Shaped
 
 from probnerf import foam, fused
 from probnerf.field import CylinderField, Field, MLPField
+from probnerf.programs import program
 from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
 
 POSE_SIZE = 7
@@ -110,7 +111,7 @@ def split_position(
     return weights, pose
 
 
-@jax.jit
+@program()
 def faces_of_view(observation: Observation, likelihood: Likelihood) -> Float[Array, "n m"]:
     """Crossings of every ray that its pixel can tell of: constants of the observation, computed once per view.
 

@@ -8,7 +8,6 @@ limit of many particles the answer does not depend on the mixture; what a finite
 """
 
 from dataclasses import dataclass, field
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +16,7 @@ from jaxtyping import Array, Float
 from probnerf.ascent import AdamConfig, ascend
 from probnerf.mixture import GaussianMixture
 from probnerf.model import Likelihood, Model, log_likelihood
+from probnerf.programs import program
 from probnerf.types import Observation
 
 # what `model.log_likelihood` takes
@@ -66,7 +66,7 @@ def log_posterior(args: tuple, _: None, positions: Float[Array, "p d"]) -> Float
     return log_likelihood(args, positions) - 0.5 * jnp.sum(weigh * positions**2, axis=-1)
 
 
-@partial(jax.jit, static_argnames="config")
+@program("config")
 def mixture_of_modes(args: Args, starts: Float[Array, "k d"], config: ModesConfig) -> GaussianMixture:
     """Gaussians about the modes that the starts climb to, and the prior.
 

@@ -139,7 +139,9 @@ def start_from(before: Posterior, populations: int) -> tuple[Float[Array, "m n d
         raise ValueError(f"{m} populations of samples do not divide into {populations}")
     order = np.argsort(np.asarray(before.population), kind="stable")
     shape = (populations, len(order) // populations)
-    return before.positions[order].reshape(*shape, size), before.log_density[order].reshape(shape)
+    positions, log_density = np.asarray(before.positions), np.asarray(before.log_density)  # so that nothing compiles
+    starts = positions[order].reshape(*shape, size), log_density[order].reshape(shape)
+    return jax.device_put(starts[0]), jax.device_put(starts[1])
 
 
 def log_prior(q: Float[Array, "... d"]) -> Float[Array, "..."]:

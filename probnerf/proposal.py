@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from probnerf.model import POSE_SIZE
 from probnerf.prior import ProbNeRF
+from probnerf.programs import program
 from probnerf.types import Pose
 from probnerf.views import camera_features, encoder_image
 
@@ -61,7 +62,7 @@ def guesses(
     return encoder_positions(key, model, picture, np.zeros(1, np.float32), count, 1.0)[:, : model.latent]
 
 
-@jax.jit
+@program()
 def _encoder_positions(
     model: ProbNeRF, picture: Picture, yaws: Float[Array, "y"], noise: Float[Array, "y j k"], spread: float
 ) -> Float[Array, "y_j d"]:

@@ -16,7 +16,6 @@ resampling made agree with each other, and would let it run ahead.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -37,6 +36,7 @@ from probnerf.hmc import (
     hmc_step,
 )
 from probnerf.populations import gathered, log_prior
+from probnerf.programs import program
 from probnerf.resampling import choose, next_beta
 from probnerf.types import Posterior
 
@@ -107,7 +107,7 @@ def _metrics(force, log_w, config: TemperedSMCConfig) -> Metric:
     return metric if config.metric else Metric(metric.basis, jnp.ones_like(metric.frequency))
 
 
-@partial(jax.jit, static_argnames=("log_likelihood", "config"))
+@program("log_likelihood", "config")
 def _start(key, args, q0, log_w0, reference, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig):
     """Importance step from q0 [m, p0, d], whose weights for the reference are exp(log_w0), to the first beta > 0."""
     populations, count, dim = q0.shape
@@ -140,7 +140,7 @@ def _start(key, args, q0, log_w0, reference, *, log_likelihood: LogLikelihood, c
     return state, _Info(ess, jnp.full(populations, jnp.nan), state.step_size[:, 0], jnp.zeros((), jnp.int32))
 
 
-@partial(jax.jit, static_argnames=("log_likelihood", "config"))
+@program("log_likelihood", "config")
 def _stage(key, state: _State, args, reference, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig):
     """`moves` iterations at the present beta, then the step to the next beta and resampling (at beta = 1: neither)."""
     target = Target(log_likelihood, args, state.beta[:, None], state.metric, reference)
@@ -186,17 +186,17 @@ def _stage(key, state: _State, args, reference, *, log_likelihood: LogLikelihood
     return state, info, pool
 
 
-@partial(jax.jit, static_argnames=("shape",))
+@program("shape")
 def _prior_start(key, *, shape: tuple[int, int, int]):
     return jax.random.normal(key, shape), jnp.zeros(shape[:2])
 
 
-@partial(jax.jit, static_argnames=("shape",))
+@program("shape")
 def _reference_start(key, reference, *, shape: tuple[int, int, int]):
     return reference.draw(key, shape[0] * shape[1]).reshape(shape), jnp.zeros(shape[:2])
 
 
-@jax.jit
+@program()
 def _proposal_start(q0, log_q0):
     return q0, log_prior(q0) - log_q0
 
