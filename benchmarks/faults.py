@@ -114,12 +114,13 @@ def no_depth(frame: Frame, amount: float) -> Frame:
 
 @dataclass(frozen=True)
 class Axis:
-    """One thing that is made worse: by a fault of the frame, or by another configuration."""
+    """One thing that is made worse: by a fault of the frame, another configuration, or pictures that add nothing."""
 
     name: str
     amounts: tuple[float, ...]  # the first is how it ships
     fault: Callable[[Frame, float], Frame] | None = None
     configured: Callable[[ControllerConfig, float], ControllerConfig] | None = field(default=None, compare=False)
+    repeated: bool = False  # the frame comes so often, as from one tripod
 
 
 def _infer(name: str) -> Callable[[ControllerConfig, float], ControllerConfig]:
@@ -162,6 +163,7 @@ AXES = (
     Axis("mask beside, px", (0.0, 3.0, 10.0, 30.0), mask_shift),
     Axis("plane tilted, degrees", (0.0, 1.0, 3.0, 10.0), plane_tilt),
     Axis("occluded, share", (0.0, 0.3, 0.6, 0.8, 0.95), occlusion),
+    Axis("one frame again, times", (1.0, 300.0), repeated=True),
     Axis("noise instead of shape, share", (0.0, 0.1, 0.3, 1.0), noise_frame),
     Axis("wall_sigma, times", (1.0, 0.3, 0.1), configured=_infer("wall_sigma")),
     Axis("wall_sigma too large, times", (1.0, 3.0, 10.0), configured=_infer("wall_sigma")),

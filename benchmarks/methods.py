@@ -227,15 +227,20 @@ def _estimate(
     return Method(name, group, label, sample, settings, conditions, programs, smc=True)
 
 
-VI, PAPER = _vi(VIConfig()), _hmc("paper", "paper", annealed(100, 100), TELLING)
+def paper_schedule(hmc: AnnealedHMCConfig, conditions: tuple[str, ...] = CONDITIONS) -> Method:
+    """The paper's sampler at some length."""
+    return _hmc("paper", "paper", hmc, conditions)
+
+
+VI, PAPER = _vi(VIConfig()), paper_schedule(annealed(100, 100), TELLING)
 FULL = PAPER.name  # the paper's own schedule; it takes long
 METHODS = (
     _encoder(),
     _map(),
     VI,
-    _hmc("paper", "paper", annealed(10, 10)),
-    _hmc("paper", "paper", annealed(20, 20)),
-    _hmc("paper", "paper", annealed(50, 50), WITH_DEPTH),
+    paper_schedule(annealed(10, 10)),
+    paper_schedule(annealed(20, 20)),
+    paper_schedule(annealed(50, 50), WITH_DEPTH),
     PAPER,
     _hmc("fixed", "fixed temperature", replace(annealed(20, 100), s_start=0.1), TELLING),
     _estimate("smc", "smc", "x1", stages=60),

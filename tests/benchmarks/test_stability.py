@@ -62,7 +62,7 @@ def test_answers_that_are_there_are_not_made_again(tmp_path: Path, monkeypatch: 
         return Seen(0.2 + amount, amount > 0.5, p_free=(0.99, 0.1), occupied=(False, True))
 
     monkeypatch.setattr("benchmarks.stability.look", looked)
-    settings = {"n": 1, "axes": "occluded;flying", "results": tmp_path / "kept.jsonl"}
+    settings = {"n": 1, "seeds": 1, "axes": "occluded;flying", "results": tmp_path / "kept.jsonl"}
     first = main(tmp_path, **settings)
     assert len(asked) == 1 + 4 + 3  # as it ships once
     again = main(tmp_path, **settings, only_chart=True)
@@ -72,6 +72,29 @@ def test_answers_that_are_there_are_not_made_again(tmp_path: Path, monkeypatch: 
     assert value["occluded, share", "0.6", "flagged"] == 1.0 and value["occluded, share", "0.3", "flagged"] == 0.0
     with pytest.raises(ValueError, match="leave --only-chart"):
         main(tmp_path, **{**settings, "n": 2}, only_chart=True)
+
+
+def test_seeds_are_told_apart_from_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = {(0, 0.0): 0.1, (1, 0.0): 0.1, (0, 8.0): 0.3, (1, 8.0): 0.5}
+
+    def looked(picture, axis: Axis, amount: float, prior, rate, seed: int) -> Seen:
+        return Seen(scores.get((seed, amount), 0.2), False, p_free=(0.99,), occupied=(False,))
+
+    monkeypatch.setattr("benchmarks.stability.look", looked)
+    rows = main(tmp_path, n=2, seeds=2, axes="flying", results=tmp_path / "kept.jsonl")
+    row = {(r.condition, r.metric): r for r in rows}
+    assert row["8", "hidden_nll"].value == pytest.approx(0.4) and row["8", "hidden_nll"].n == 2
+    assert row["8", "between_seeds"].value == pytest.approx(np.std([0.3, 0.5], ddof=1))
+    assert row["0", "between_seeds"].value == 0.0 and row["8", "flagged"].n == 4
+
+
+@pytest.mark.slow
+def test_a_frame_that_comes_again_takes_no_doubt() -> None:
+    prior, rate, picture = load_prior(None), base_rate(128), any_view(TEST_SEEDS[FIRST])
+    axis = next(a for a in AXES if a.repeated)
+    once, often = (look(picture, axis, amount, prior, rate, 0) for amount in (1.0, 12.0))
+    assert once.hidden_nll == look(picture, AXES[0], 0.0, prior, rate, 0).hidden_nll  # as without a tracker
+    assert often == once
 
 
 @pytest.mark.slow
