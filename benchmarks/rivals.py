@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 
 from benchmarks.scene import GRID, VesselView
 from benchmarks.score import Answer
-from perception.controller import ControllerConfig, crop, estimate
+from perception.controller import ControllerConfig, estimate
+from perception.crop import crop
 from perception.observe import ObjectFrame, observe
 from perception.seen import answered_voxels
 from perception.segment import Segment

@@ -17,17 +17,16 @@ from functools import cached_property
 from threading import RLock
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from perception.crop import crop
 from perception.hypotheses import Hypotheses
 from perception.observe import ObjectFrame, ObserveConfig, observe
 from perception.publish import PublishConfig, View, published
 from perception.seen import seen_voxels
 from perception.segment import Segment
 from perception.source import Frame
-from probnerf.families.render import look_at, pinhole_rays
 from probnerf.hmc import StageInfo
 from probnerf.infer import (
     InferConfig,
@@ -46,8 +45,7 @@ from probnerf.prior import ProbNeRF
 from probnerf.proposal import Picture
 from probnerf.smc import TemperedSMCConfig
 from probnerf.store import Prior
-from probnerf.types import OBJECT, UNKNOWN, Observation, Posterior
-from probnerf.views import ENCODER_RADIUS
+from probnerf.types import Observation, Posterior
 
 # Two batches of eigenvalues may wait for each other for ever: each holds a thread of XLA's pool, one per core, until
 _ONE_AT_A_TIME = RLock()  # another thread of that pool has done its parts (jaxlib's ParallelBatchMap)
@@ -234,8 +232,10 @@ class _Work:
 
     @cached_property
     def picture(self) -> Picture | None:
-        """What the encoder sees. It was trained on objects with ranges; without, sampling begins at the prior."""
-        if self.view.frame.depth is None or not isinstance(self.prior.model, ProbNeRF):
+        """What the encoder sees. Without the ranges that it was trained with there is none, nor where the pose is known
+        (guesses at one yaw climb to poor modes): sampling begins at the prior.
+        """
+        if self.pose_known or self.view.frame.depth is None or not isinstance(self.prior.model, ProbNeRF):
             return None
         return crop(self.view.frame, self.view.segment, self.view.object_frame, self.prior.model.preset.image_size)
 
@@ -274,7 +274,7 @@ class _Work:
         assert isinstance(model, ProbNeRF) and self.picture is not None
         if self.on_answer is not None and self.fresh:
             self._answer(encoder_guess(key, model, self.likelihood, self.view.observation, self.picture))
-        self.reference = modes_of(key, model, self.view.observation, config, self.picture, not self.pose_known)
+        self.reference = modes_of(key, model, self.view.observation, config, self.picture)
         climbed = config.modes.gradients(self.likelihood.dim(model))
         self.point_gradients += climbed * crossings_of(self.likelihood, self.view.observation)
 
@@ -317,34 +317,3 @@ class _Work:
     def amount(self, runs: int) -> str:
         """The particles of so many runs, in words."""
         return f"{runs * self.smc.populations} x {self.smc.particles} particles"
-
-
-def crop(frame: Frame, segment: Segment, cube: ObjectFrame, size: int) -> Picture:
-    """The encoder's picture: the frame as seen by a camera at the same place that looks at the cube's centre.
-
-    A rotation of the camera moves no parallax, so this is a look-up: each pixel takes the nearest one of the frame.
-    """
-    centre = cube.to_cube(np.zeros(3))
-    tan_half = ENCODER_RADIUS / float(np.linalg.norm(centre))
-    T_view_camera = look_at(centre, np.zeros(3))
-    _, directions = pinhole_rays(T_view_camera, 0.5 * size / tan_half, size)
-    rays = directions.astype(np.float64) @ cube.T_camera_object[:3, :3].T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pixels = np.round(frame.camera.project(rays)).astype(int)
-    height, width = segment.mask.shape
-    inside = (rays[:, 2] > 0) & np.all((pixels >= 0) & (pixels < [width, height]), axis=1)
-    u, v = np.where(inside[:, None], pixels, 0).T
-    status = np.where(inside, segment.status[v, u], UNKNOWN)
-    assert frame.depth is not None
-    z = frame.depth[v, u]
-    range_cube = np.where(np.isfinite(z), z, 0.0) / np.maximum(rays[:, 2], 1e-6) / cube.half_extent
-    is_object = status == OBJECT
-    return Picture(
-        rgb=jnp.asarray((frame.rgb[v, u] / 255.0).reshape(size, size, 3), jnp.float32),
-        distance=jnp.asarray(
-            np.where(is_object, np.where(np.isfinite(z), range_cube, -1.0), 0.0).reshape(size, size), jnp.float32
-        ),
-        unknown=jnp.asarray((status == UNKNOWN).reshape(size, size), jnp.float32),
-        T_view_camera=jnp.asarray(T_view_camera, jnp.float32),
-        tan_half_fov=jnp.asarray(tan_half, jnp.float32),
-    )

@@ -146,14 +146,9 @@ def asks_encoder(config: InferConfig, model: Model, picture: Picture | None) -> 
 
 
 def modes_of(
-    key: Array,
-    model: Model,
-    observation: Observation,
-    config: InferConfig,
-    picture: Picture | None,
-    sample_pose: bool = True,
+    key: Array, model: Model, observation: Observation, config: InferConfig, picture: Picture | None
 ) -> GaussianMixture | None:
-    """Where tempering begins: the modes that the encoder's guesses climb to (`probnerf.modes`).
+    """Where tempering begins: the modes that the encoder's guesses climb to (`probnerf.modes`), the pose unknown.
 
     None, the prior, where there is no encoder to ask or too little for it to see. Behind something that hides half of
     the object its guesses are poor, and modes about them miss what populations from the prior find.
@@ -161,8 +156,8 @@ def modes_of(
     if not asks_encoder(config, model, picture):
         return None
     assert isinstance(model, ProbNeRF) and picture is not None
-    likelihood = likelihood_of(config, observation, sample_pose)
-    starts = guesses(key, model, picture, config.modes.starts, sample_pose)
+    likelihood = likelihood_of(config, observation)
+    starts = guesses(key, model, picture, config.modes.starts)
     args = (model, likelihood, observation, faces_of_view(observation, likelihood))
     return mixture_of_modes(args, starts, config.modes)
 

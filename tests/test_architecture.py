@@ -37,6 +37,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "jax": (
         "probnerf/*",
         "perception/observe.py",
+        "perception/crop.py",
         "perception/controller.py",
         "perception/publish.py",
         "perception/warm.py",

@@ -16,7 +16,7 @@ from probnerf.mixture import GaussianMixture
 from probnerf.model import CylinderModel, log_likelihood, log_likelihood_one
 from probnerf.modes import ModesConfig, log_posterior, mixture_of_modes
 from probnerf.prior import PRESETS, ProbNeRF
-from probnerf.proposal import Picture, potential_at
+from probnerf.proposal import Picture, guesses, potential_at
 from probnerf.smc import TemperedSMCConfig, tempered_smc
 from probnerf.types import Pose
 
@@ -155,29 +155,33 @@ def _tiny():
     return model, picture, scene("hidden", True)[2]
 
 
-@pytest.mark.parametrize("sample_pose", [True, False])
-def test_the_modes_of_a_view_are_sought_where_the_encoder_says(sample_pose):
+def test_the_modes_of_a_view_are_sought_where_the_encoder_says():
     model, picture, observation = _tiny()
     config = InferConfig(lattice=8, modes=ModesConfig(starts=6, screen=AdamConfig(steps=2), climb=AdamConfig(steps=2)))
-    found = modes_of(jax.random.key(1), model, observation, config, picture, sample_pose)
+    found = modes_of(jax.random.key(1), model, observation, config, picture)
     assert found is not None
-    dim = model.latent + 7 * sample_pose
+    dim = model.latent + 7
     assert found.mean.shape == (4, dim) and np.isfinite(found.root).all() and np.isfinite(found.mean).all()
-    if sample_pose:  # one of each two of six even yaws, hardly climbed
-        yaw = np.degrees(np.arctan2(found.mean[:3, model.latent + 1], found.mean[:3, model.latent])) + 180.0
-        nearest = np.round(yaw / 60.0)
-        np.testing.assert_allclose(yaw, 60.0 * nearest, atol=20.0)
-        np.testing.assert_array_equal(np.mod(nearest, 6) // 2, [0, 1, 2])
-    else:  # it stands canonically, about the encoder's mean there
-        zero = jnp.zeros(())
-        mean, precision = potential_at(model, picture, Pose(zero, zero, zero, zero, zero))
-        z, _ = jax.vmap(model.flow.forward)(found.mean[:3])
-        assert np.all(np.abs(z - mean) * np.sqrt(precision) < 6.0)
+    # one of each two of six even yaws, hardly climbed
+    yaw = np.degrees(np.arctan2(found.mean[:3, model.latent + 1], found.mean[:3, model.latent])) + 180.0
+    nearest = np.round(yaw / 60.0)
+    np.testing.assert_allclose(yaw, 60.0 * nearest, atol=20.0)
+    np.testing.assert_array_equal(np.mod(nearest, 6) // 2, [0, 1, 2])
     posterior, _ = infer(
         jax.random.key(2), model, observation, replace(config, smc=TemperedSMCConfig(particles=8, start_particles=8)),
-        reference=found, sample_pose=sample_pose, stages=1,
+        reference=found, stages=1,
     )  # fmt: skip
     assert posterior.positions.shape[-1] == dim and np.isfinite(posterior.log_density).all()
+
+
+def test_guesses_at_a_known_pose_stand_about_the_encoder_s_mean_there():
+    model, picture, _ = _tiny()
+    found = guesses(jax.random.key(1), model, picture, 5, sample_pose=False)
+    assert found.shape == (5, model.latent)
+    zero = jnp.zeros(())
+    mean, precision = potential_at(model, picture, Pose(zero, zero, zero, zero, zero))
+    z, _ = jax.vmap(model.flow.forward)(found)
+    assert np.all(np.abs(z - mean) * np.sqrt(precision) < 6.0) and len(np.unique(np.asarray(found), axis=0)) == 5
 
 
 def test_there_is_nothing_to_begin_at_without_a_picture_an_encoder_enough_to_see_or_room_for_delta():
