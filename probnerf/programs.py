@@ -42,7 +42,9 @@ def _folder() -> Path | None:
         return None
     own = Path(named) / f"programs-{_environment()}"
     try:
-        own.mkdir(parents=True, exist_ok=True)
+        own.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if own.stat().st_uid != os.getuid():  # what is read from it is run
+            return None
         own.touch()
         generations = sorted(own.parent.glob("programs-*"), key=lambda f: f.stat().st_mtime, reverse=True)
     except OSError:  # as without: slower by some seconds

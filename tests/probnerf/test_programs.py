@@ -122,6 +122,9 @@ def test_no_folder_or_one_that_cannot_be_made_keeps_nothing(tmp_path: Path, monk
     own = folder()
     kept = sorted(p.name for p in tmp_path.glob("programs-*"))
     assert own is not None and kept == sorted([own.name, "programs-3", "programs-4"])
+    assert own.stat().st_mode & 0o077 == 0
+    monkeypatch.setattr(os, "getuid", lambda: own.stat().st_uid + 1)
+    assert folder() is None  # another's
 
 
 def test_the_sampler_answers_bit_for_bit_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
