@@ -78,7 +78,7 @@ class VesselView:
     shape: TabletopObject | None  # None: none of the family
     T_canonical_view: Float[np.ndarray, "4 4"]  # affine: from the view's cube to the shape's, cube units both
     solid: Bool[np.ndarray, "32 32 32"]
-    seen: Bool[np.ndarray, "32 32 32"]  # by the true geometry
+    seen: Bool[np.ndarray, "32 32 32"]  # by the true geometry; without depth, in silhouette
     near_handle: Bool[
         np.ndarray, "32 32 32"
     ]  # outside the body, where the true handle passes as it turns about the axis
@@ -120,8 +120,9 @@ def vessel_view(
 
     A `fault` is done to the frame on top of the sensor's; what is truly seen and there stays what it is. Without
     `depth` the segment is the true mask's, on the plane that the camera's pose over the table gives (with
-    `PlaneGuess`'s errors of it): what a user has to say of a picture. With `pose_known` the cube is the object's own,
-    as a marker on it would tell. Raises ValueError where perception refuses.
+    `PlaneGuess`'s errors of it): what a user has to say of a picture; only what is beside the outline counts as seen.
+    With `pose_known` the cube is the object's own, as a marker on it would tell. Raises ValueError where perception
+    refuses.
     """
     placed, camera, seed = picture.placed, picture.camera, picture.placed.seed
     frame = sense(picture.picture, camera, picture.T_world_camera, seed)
@@ -132,7 +133,9 @@ def vessel_view(
         cube = ObjectFrame(picture.T_camera_object, placed.half_extent, found.plane, 0.0, 0.0)
     else:
         cube = object_frame(frame, found, ObserveConfig())
-    faultless = Frame(0, frame.frame_id, frame.rgb, picture.picture.depth.astype(np.float32), None, camera)
+    # Without depth no pixel sees where the object is: scored behind its true surface alone, voxels would tell that
+    true_depth = picture.picture.depth.astype(np.float32) if depth else None
+    faultless = Frame(0, frame.frame_id, frame.rgb, true_depth, None, camera)
     T_canonical_view = _affine(cube, picture.T_camera_object, placed.half_extent)
     body, handle = (np.asarray(a) for a in _parts(placed.shape, T_canonical_view, FINE))
     swept = np.asarray(_swept(placed.shape, T_canonical_view, GRID))

@@ -77,6 +77,18 @@ def test_where_the_pose_is_known_the_cube_is_the_object_s_own_and_only_its_shape
     assert not found.hypotheses.pose.any() and found.object_frame is view.cube
 
 
+def test_without_depth_what_counts_as_seen_tells_nothing_of_where_the_surface_is():
+    """Every voxel on a ray to the object counts as unseen, before the surface as behind it."""
+    picture = vessel_picture(2_000_001, "hidden")
+    assert picture is not None
+    view = vessel_view(picture, depth=False)
+    assert not (view.solid & view.seen).sum() > 0.03 * view.solid.sum()
+    camera = view.cube.to_camera(voxel_centres(32).reshape(-1, 3))
+    u, v = np.round(view.frame.camera.project(camera)).astype(int).T
+    on_object = view.segment.mask[v.clip(0, view.segment.mask.shape[0] - 1), u.clip(0, view.segment.mask.shape[1] - 1)]
+    assert not view.seen.ravel()[on_object].any() and on_object.sum() > 2 * view.solid.sum()
+
+
 def test_what_the_camera_saw_as_free_is_not_solid(vessel):
     """Of the solid only the visible skin is seen, and every hit lies close to the true solid."""
     assert (vessel.seen & vessel.solid).sum() < 0.5 * vessel.solid.sum()
