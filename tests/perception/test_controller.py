@@ -9,7 +9,10 @@ import pytest
 
 from perception.controller import ControllerConfig, Estimate, estimate
 from perception.hypotheses import Hypotheses
-from perception.segment import segment
+from perception.log import Log
+from perception.segment import Segment, segment
+from perception.source import SHIPPED_LOG
+from perception.warm import _alone
 from probnerf.infer import InferConfig, quick_smc
 from probnerf.store import load_prior
 from tests.perception.test_track import frame_from
@@ -107,9 +110,17 @@ def test_no_particles_are_refused() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_two_threads_ask_at_once_and_both_are_answered() -> None:
-    """With two cores the library of eigenvalues would wait for ever, each for the thread that the other holds."""
-    answers_of(CONFIG, stages=1)
+    """From modes and from the prior at once: on two cores the library of eigenvalues would wait for ever, each for the
+    thread that the other holds.
+    """
+    frame, prior = next(iter(Log(SHIPPED_LOG))), load_prior()
+    hidden = segment(frame)[0]
+    both = (_alone(hidden), hidden)
+
+    def opacity(seen: Segment) -> np.ndarray:
+        return estimate(frame, seen, prior, stages=6).hypotheses.opacity
+
+    expected = [opacity(seen) for seen in both]
     with ThreadPoolExecutor(2) as threads:
-        found = [found for found, _ in threads.map(lambda _: answers_of(CONFIG, stages=20), range(4))]
-    for other in found[1:]:
-        np.testing.assert_array_equal(other.hypotheses.opacity, found[0].hypotheses.opacity)
+        found = list(threads.map(opacity, both))
+    np.testing.assert_array_equal(found, expected)
