@@ -90,10 +90,8 @@ class Program:
         path = folder / f"{self._name[1]}-{hashlib.sha256(said.encode()).hexdigest()[:32]}"
         try:
             return _read(path, given)
-        except FileNotFoundError:
+        except Exception:  # not there, cut short, or of a library that reads it otherwise: made, and written over
             pass
-        except Exception:  # cut short, or of a library that reads it otherwise: made again
-            path.unlink(missing_ok=True)
         compiled = _compiled(self.jitted.lower(**given, **static))
         _write(path, compiled)
         return compiled
@@ -124,12 +122,12 @@ def _write(path: Path, compiled: jax.stages.Compiled) -> None:
         code, _, out_tree = serialize_executable.serialize(compiled)
     except (ValueError, NotImplementedError):  # it closes over arrays: compiled anew in each process
         return
-    devices = sorted(d.id for s in jax.tree.leaves(compiled.input_shardings) for d in s.device_set)
+    devices = {d.id for s in jax.tree.leaves(compiled.input_shardings) for d in s.device_set}
     # the tree as an object: equinox's marks of absent fields do not survive in a pickled treedef
     answer = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))
     partial = path.with_suffix(f".{os.getpid()}")
     try:
-        partial.write_bytes(pickle.dumps((code, sorted(set(devices)), answer)))
+        partial.write_bytes(pickle.dumps((code, sorted(devices), answer)))
         partial.replace(path)
     except OSError:  # a full disk costs the next start its time, and no answer
         partial.unlink(missing_ok=True)
