@@ -54,8 +54,8 @@ inline void colour_forward(const Sizes& s, const Layers& w, const Direction* ray
   multiply(n, s.H, s.width, t.c0, s.H, 1, w.k4, s.H, t.c1, s.H);
   relu(t.c1, n * s.H);
   for (int i = 0; i < 3; ++i) {
-    for (int p = 0; p < n; ++p) t.colour[i][p] = dot(t.c1 + p * s.H, w.k5 + i * s.H, s.H) + w.b5[i];
-    for (int p = 0; p < n; p += LANES) store(t.colour[i] + p, 1.0f / (1.0f + exp(-load(t.colour[i] + p))));
+    dot_rows(t.c1, n, s.H, w.k5 + i * s.H, t.colour[i]);
+    for (int p = 0; p < n; p += LANES) store(t.colour[i] + p, 1.0f / (1.0f + exp(-load(t.colour[i] + p) - w.b5[i])));
   }
 }
 
@@ -79,8 +79,7 @@ inline void colour_backward(const Sizes& s, const Layers& w, const Transposed& w
     }
     for (int i = 0; i < 3; ++i) store(g.k5 + i * s.H + v, gk[i]);
   }
-  for (int i = 0; i < 3; ++i)
-    for (int p = 0; p < n; ++p) g.b5[i] += go[i][p];
+  for (int i = 0; i < 3; ++i) g.b5[i] += total(go[i], n);
   multiply(s.width, s.H, n, t.c0, 1, s.H, t.g1, s.H, g.k4, s.H);
   add_rows(g.b4, t.g1, n, s.H);
   memset(t.g0, 0, sizeof(float) * n * s.H);
@@ -90,7 +89,9 @@ inline void colour_backward(const Sizes& s, const Layers& w, const Transposed& w
   multiply(1, s.H, n, t.log_sigma, 0, 1, t.g0, s.H, g.k3s, s.H);
   for (int p = 0; p < t.count; ++p) add_rows(rays[t.ray[p]].sum, t.g0 + p * s.H, 1, s.H);
   multiply(n, s.E, s.width, t.g0, s.H, 1, wt.k3, s.E, t.g_encoding, s.E);
-  for (int p = 0; p < t.count; ++p) t.g_sigma[p] += dot(t.g0 + p * s.H, w.k3s, s.H) / (1.0f + t.sigma[p]);
+  dot_rows(t.g0, n, s.H, w.k3s, t.log_sigma);  // its gradient, where it stood
+  for (int p = 0; p < n; p += LANES)
+    store(t.g_sigma + p, load(t.g_sigma + p) + load(t.log_sigma + p) / (1.0f + load(t.sigma + p)));
 }
 
 }  // namespace FARSIDE_NAMESPACE

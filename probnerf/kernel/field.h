@@ -131,15 +131,19 @@ struct Tile {
   }
 };
 
-// Point p of a tile whose density is known, as point `to` of another.
-inline void copy_point(const Sizes& s, const Tile& from, int p, Tile& t, int to) {
-  for (int i = 0; i < 3; ++i) t.q[i][to] = from.q[i][p];
-  for (int c = 0; c < s.channels; ++c) t.x[c * s.tile + to] = from.x[c * s.tile + p];
-  for (int f = 0; f < s.encoded; ++f) t.encoding[f * s.tile + to] = from.encoding[f * s.tile + p];
-  memcpy(t.h0 + to * s.H, from.h0 + p * s.H, sizeof(float) * s.H);
-  memcpy(t.h1 + to * s.H, from.h1 + p * s.H, sizeof(float) * s.H);
-  t.output[to] = from.output[p], t.mlp_sigma[to] = from.mlp_sigma[p], t.sigma[to] = from.sigma[p];
-  t.window[to] = from.window[p], t.slope[to] = from.slope[p], t.axis[to] = from.axis[p];
+// `count` points from p on of a tile whose density is known, as points from `to` on of another.
+inline void copy_points(const Sizes& s, const Tile& from, int p, int count, Tile& t, int to) {
+  auto copy = [&](const float* a, float* b) {
+    for (int i = 0; i < count; ++i) b[to + i] = a[p + i];
+  };
+  for (int i = 0; i < 3; ++i) copy(from.q[i], t.q[i]);
+  for (int c = 0; c < s.channels; ++c) copy(from.x + c * s.tile, t.x + c * s.tile);
+  for (int f = 0; f < s.encoded; ++f) copy(from.encoding + f * s.tile, t.encoding + f * s.tile);
+  memcpy(t.h0 + to * s.H, from.h0 + p * s.H, sizeof(float) * s.H * count);
+  memcpy(t.h1 + to * s.H, from.h1 + p * s.H, sizeof(float) * s.H * count);
+  copy(from.output, t.output), copy(from.mlp_sigma, t.mlp_sigma), copy(from.sigma, t.sigma);
+  copy(from.window, t.window), copy(from.slope, t.slope);
+  for (int i = 0; i < count; ++i) t.axis[to + i] = from.axis[p + i];
 }
 
 // Points that fill the last vector and count for nothing.
@@ -172,6 +176,22 @@ inline void relu(float* h, int count) {
 }
 inline void only_where_positive(float* g, const float* h, int count) {
   for (int i = 0; i < count; i += LANES) store(g + i, value(bits(load(g + i)) & (load(h + i) > 0.0f)));
+}
+inline float total(const float* a, int count) {
+  Vec t = {};
+  for (int i = 0; i < count; i += LANES) t += load(a + i);
+  return sum(t);
+}
+// out[r] = a[r] . b for rows of `columns`; both numbers are multiples of LANES.
+inline void dot_rows(const float* a, int rows, int columns, const float* b, float* out) {
+  for (int r = 0; r < rows; r += LANES) {
+    Vec parts[LANES];
+    for (int i = 0; i < LANES; ++i) {
+      parts[i] = load(a + (r + i) * columns) * load(b);
+      for (int v = LANES; v < columns; v += LANES) parts[i] += load(a + (r + i) * columns + v) * load(b + v);
+    }
+    store(out + r, sums(parts));
+  }
 }
 inline float dot(const float* a, const float* b, int count) {
   Vec t = {};
@@ -238,9 +258,10 @@ inline void density_forward(const Sizes& s, const Layers& w, Tile& t) {
   fill_rows(t.h1, n, s.H, w.b1);
   multiply(n, s.H, s.width, t.h0, s.H, 1, w.k1, s.H, t.h1, s.H);
   relu(t.h1, n * s.H);
-  for (int p = 0; p < n; ++p) t.output[p] = dot(t.h1 + p * s.H, w.k2, s.H) + w.b2[0];
+  dot_rows(t.h1, n, s.H, w.k2, t.output);
   for (int p = 0; p < n; p += LANES) {
-    Vec o = load(t.output + p);
+    Vec o = load(t.output + p) + w.b2[0];
+    store(t.output + p, o);
     Vec density = s.density_scale * (maximum(o, Vec{}) + log1p(exp(-absolute(o))));  // softplus
     store(t.mlp_sigma + p, density);
     store(t.sigma + p, density * load(t.window + p));
@@ -256,13 +277,16 @@ inline void density_backward(const Sizes& s, const Layers& w, const Transposed& 
     Vec logistic = 1.0f / (1.0f + exp(-o));
     store(go + p, load(t.g_sigma + p) * load(t.window + p) * s.density_scale * logistic);
   }
-  for (int p = 0; p < n; ++p)
-    for (int v = 0; v < s.H; v += LANES) {
+  for (int v = 0; v < s.H; v += LANES) {
+    Vec k = load(w.k2 + v), gk = load(g.k2 + v);
+    for (int p = 0; p < n; ++p) {
       Vec h = load(t.h1 + p * s.H + v);
-      store(t.g1 + p * s.H + v, value(bits(go[p] * load(w.k2 + v)) & (h > 0.0f)));
-      store(g.k2 + v, load(g.k2 + v) + go[p] * h);
+      store(t.g1 + p * s.H + v, value(bits(go[p] * k) & (h > 0.0f)));
+      gk += go[p] * h;
     }
-  for (int p = 0; p < n; ++p) g.b2[0] += go[p];
+    store(g.k2 + v, gk);
+  }
+  g.b2[0] += total(go, n);
   multiply(s.width, s.H, n, t.h0, 1, s.H, t.g1, s.H, g.k1, s.H);
   add_rows(g.b1, t.g1, n, s.H);
   memset(t.g0, 0, sizeof(float) * n * s.H);

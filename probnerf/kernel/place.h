@@ -21,21 +21,24 @@ struct PoseMatrix {
 };
 
 struct Window {
-  float value, slope;  // slope: the derivative by ...
-  int axis;            // ... this coordinate
+  Vec value, slope;  // slope: the derivative by ...
+  Int axis;          // ... this coordinate
 };
 
-inline Window window(float x, float y, float z) {
-  const float margin = 0.1f, q[3] = {x, y, z};
-  int axis = 0;
-  for (int i = 1; i < 3; ++i)
-    if (fabsf(q[i]) > fabsf(q[axis])) axis = i;
-  float beyond = fabsf(q[axis]) - 1.0f, below = 5.0f * (BASE_Z - 0.02f - z);
-  float u = 1.0f - (beyond > below ? beyond : below) / margin;
-  float slope = beyond > below ? (q[axis] > 0.0f ? -1.0f : 1.0f) : 5.0f;
-  slope = u > 0.0f && u < 1.0f ? 6.0f * u * (1.0f - u) * slope / margin : 0.0f;
-  u = u < 0.0f ? 0.0f : u > 1.0f ? 1.0f : u;
-  return {u * u * (3.0f - 2.0f * u), slope, beyond > below ? axis : 2};
+inline Window window(Vec x, Vec y, Vec z) {
+  const float margin = 0.1f;
+  Int wider = absolute(y) > absolute(x);
+  Vec q = select(wider, y, x);
+  Int higher = absolute(z) > absolute(q);
+  q = select(higher, z, q);
+  Int axis = (higher & 2) | (~higher & wider & 1);
+  Vec beyond = absolute(q) - 1.0f, below = 5.0f * (BASE_Z - 0.02f - z);
+  Int outside = beyond > below;
+  Vec u = 1.0f - select(outside, beyond, below) / margin;
+  Vec slope = select(outside, select(q > 0.0f, splat(-1.0f), splat(1.0f)), splat(5.0f));
+  slope = value(bits(6.0f * u * (1.0f - u) * slope / margin) & (u > 0.0f) & (u < 1.0f));
+  u = minimum(maximum(u, Vec{}), splat(1.0f));
+  return {u * u * (3.0f - 2.0f * u), slope, (outside & axis) | (~outside & 2)};
 }
 
 // 0, or not a number where a weight or the pose is none: a ReLU would hide it.

@@ -48,16 +48,20 @@ void run_points(const FieldSizes& f, const Points& points, const Shape* shapes, 
     PoseMatrix pose(shape.pose);
     int64_t begin = item % pieces * PIECE, end = begin + PIECE < points.count ? begin + PIECE : points.count;
     t.count = 0;
-    for (int64_t i = begin; i < end; ++i) {
-      const float* p = points.at + 3 * i;
-      float q[3];
-      pose.to_object(p[0], p[1], p[2], q);
-      shape.density[i] = none + 0.0f * (q[0] + q[1] + q[2]);
-      float inside_window = window(q[0], q[1], q[2]).value;
-      if (inside_window == 0.0f) continue;
-      for (int j = 0; j < 3; ++j) t.q[j][t.count] = q[j];
-      t.window[t.count] = inside_window, inside.index[t.count] = i;
-      if (++t.count == s.tile) evaluate(s, inside, shape.density);
+    for (int64_t i = begin; i < end; i += LANES) {
+      Vec at[3] = {}, q[3];
+      int64_t lanes = end - i < LANES ? end - i : LANES;
+      for (int64_t k = 0; k < lanes; ++k)
+        for (int j = 0; j < 3; ++j) at[j][k] = points.at[3 * (i + k) + j];
+      pose.to_object(at[0], at[1], at[2], q);
+      Vec within = window(q[0], q[1], q[2]).value, nan = none + 0.0f * (q[0] + q[1] + q[2]);
+      for (int64_t k = 0; k < lanes; ++k) {
+        shape.density[i + k] = nan[k];
+        if (within[k] == 0.0f) continue;
+        for (int j = 0; j < 3; ++j) t.q[j][t.count] = q[j][k];
+        t.window[t.count] = within[k], inside.index[t.count] = i + k;
+        if (++t.count == s.tile) evaluate(s, inside, shape.density);
+      }
     }
     evaluate(s, inside, shape.density);
   }

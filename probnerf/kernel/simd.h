@@ -66,6 +66,19 @@ inline void transpose(const float* from, long stride, float* to) {
   for (int i = 0; i < LANES; ++i) store(to + i * LANES, rows[i]);
 }
 
+// Lane i: the sum of rows[i], of LANES rows, which it leaves spoilt.
+template <int S = 1>
+inline Vec sums(Vec* rows) {
+  if constexpr (S < LANES) {
+    for (int i = 0; i < LANES; i += 2 * S) {
+      exchange<S>(rows[i], rows[i + S], std::make_integer_sequence<int, LANES>());
+      rows[i] += rows[i + S];
+    }
+    return sums<2 * S>(rows);
+  }
+  return rows[0];
+}
+
 // Round to nearest for |x| < 2^22.
 inline Vec nearest(Vec x) { return (x + 12582912.0f) - 12582912.0f; }
 inline Vec power_of_two(Vec n) {  // n whole, -126 to 127

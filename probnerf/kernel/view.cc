@@ -182,10 +182,8 @@ inline void tile_forward(const Sizes& s, const PixelModel& m, const Prepared& v,
     for (int i = 0; i < 3; ++i) at[i] = load(v.crossings.at[i] + first + p);
     pose.to_object(at[0], at[1], at[2], q);
     for (int i = 0; i < 3; ++i) store(t.q[i] + p, q[i]);
-  }
-  for (int p = 0; p < n; ++p) {
-    Window w = window(t.q[0][p], t.q[1][p], t.q[2][p]);
-    t.window[p] = w.value, t.slope[p] = w.slope, t.axis[p] = w.axis;
+    Window w = window(q[0], q[1], q[2]);
+    store(t.window + p, w.value), store(t.slope + p, w.slope), memcpy(t.axis + p, &w.axis, sizeof w.axis);
   }
   density_forward(s, k.weights, t);
   composite(m, v.crossings, pixels, range.pixels, m.per_density / pose.inverse, offset, t, k.composite,
@@ -222,11 +220,14 @@ inline void one_particle(const Sizes& s, const PixelModel& m, const Prepared& v,
         direction_forward(s, k.weights, to);
       }
       int first = v.pixels[range.first_pixel].first;
-      for (int p = 0; p < ray.count; ++p) {
+      for (int p = 0, end; p < ray.count; p = end) {  // runs of crossings that count
+        end = p + 1;
         if (!(weight[p] > NEGLIGIBLE)) continue;
-        int to = few.tile.count++;
-        copy_point(s, k.tile, ray.first - first + p, few.tile, to);
-        few.source[to] = ray.first + p, few.tile.ray[to] = few.pixels;
+        while (end < ray.count && weight[end] > NEGLIGIBLE) ++end;
+        int to = few.tile.count;
+        few.tile.count += end - p;
+        copy_points(s, k.tile, ray.first - first + p, end - p, few.tile, to);
+        for (int i = 0; i < end - p; ++i) few.source[to + i] = ray.first + p + i, few.tile.ray[to + i] = few.pixels;
       }
       few.ends[few.pixels++] = few.tile.count;
     }
