@@ -8,15 +8,15 @@ import numpy as np
 
 from perception.log import Log
 from perception.segment import Segment, segment
-from perception.source import SHIPPED_LOG, Frame
-from perception.track import Tracker
+from perception.source import SHIPPED_LOG
+from perception.track import Look, Tracker
 from probnerf.infer import infer
-from probnerf.types import FREE, UNKNOWN
+from probnerf.types import FREE, UNKNOWN, Posterior
 
 
 def warm_up(tracker: Tracker) -> None:
-    """Look at an object of the shipped recording with a tracker of the same prior and configuration: as it is there,
-    half hidden, for which inference begins at the prior, and as if nothing stood before it, for which it climbs.
+    """Look at an object of the shipped recording with a tracker of the same prior and configuration: as if nothing
+    stood before it, for which inference climbs, and half hidden, as it is there, for which it begins at the prior.
 
     Raises KeyboardInterrupt where Ctrl-C ended it, which the sampler may keep for itself.
 
@@ -25,25 +25,31 @@ def warm_up(tracker: Tracker) -> None:
     """
     frame = next(iter(Log(SHIPPED_LOG)))
     hidden = segment(frame)[0]
+    trial = replace(tracker, _tracks={}, _names=set())
     try:
-        for seen in (_alone(hidden), hidden):
-            trial = replace(tracker, _tracks={}, _names=set())
-            update = trial.update(frame, seen, stages=1, on_answer=lambda _: None)
-            if update.hypotheses.result == "interrupted":
-                raise KeyboardInterrupt
-            _go_on(trial, frame, seen)
+        update = trial.update(frame, _alone(hidden), stages=1, on_answer=lambda _: None)
+        if update.hypotheses.result == "interrupted":
+            raise KeyboardInterrupt
+        again = trial.look(frame, _alone(hidden))
+        assert again is not None
+        _sampled(trial, again, trial._tracks[again.object_id].posterior)  # what a next frame asks
+        anew = trial.look(frame, hidden, lambda _: (0, True))
+        assert anew is not None  # to publish it needs nothing new
+        _sampled(trial, anew, _sampled(trial, anew, None))
     except ValueError:  # a prior of other objects: its own first frame compiles
         pass
     gc.collect()
     gc.freeze()
 
 
-def _go_on(trial: Tracker, frame: Frame, segment: Segment) -> None:
-    """What a next frame asks, and the sampler where the answer was cut short; to publish that needs nothing new."""
-    look = trial.look(frame, segment)
-    assert look is not None
-    before, observation = trial._tracks[look.object_id].posterior, look._view.observation
-    infer(jax.random.key(0), trial.prior.model, observation, trial.config.infer, before=before, stages=1)
+def _sampled(trial: Tracker, look: Look, before: Posterior | None) -> Posterior:
+    """One stage, from an answer that was cut short or from the prior."""
+    observation = look._view.observation
+    key, config = jax.random.key(0), trial.config.infer
+    posterior, _ = infer(key, trial.prior.model, observation, config, before=before, stages=1)
+    if posterior.result == "interrupted":
+        raise KeyboardInterrupt
+    return posterior
 
 
 def _alone(segment: Segment) -> Segment:

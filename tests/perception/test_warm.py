@@ -2,6 +2,7 @@
 
 import gc
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -17,25 +18,38 @@ from probnerf.infer import explained, opacity_grids
 from probnerf.modes import mixture_of_modes
 from probnerf.prior import PRESETS, ProbNeRF
 from probnerf.store import Prior, load_prior
+from probnerf.types import UNKNOWN
 from tests.node.shapes import body_with_handle
 
 
-def _tracker(monkeypatch: pytest.MonkeyPatch, outcome: str | Exception) -> tuple[Tracker, list[Tracker]]:
-    asked = []
+def _tracker(monkeypatch: pytest.MonkeyPatch, outcome: str | Exception, then: str = "stages") -> tuple[Tracker, list]:
+    """A tracker, and what is asked of one like it: updates, looks and samples, of which none is made."""
+    asked: list = []
 
     def update(self: Tracker, frame: Any, segment: Any, **limits: Any) -> Update:
-        asked.append(self)
+        asked.append((self, "update", bool((segment.status == UNKNOWN).any())))
         if isinstance(outcome, Exception):
             raise outcome
         assert limits["stages"] == 1 and limits["on_answer"](None) is None
+        monkeypatch.setitem(self.__dict__["_tracks"], 1, SimpleNamespace(posterior="its own"))
         return Update("new", replace(body_with_handle(), result=outcome), 1, 0.0, 0.0)
 
+    def look(self: Tracker, frame: Any, segment: Any, how: Any = None) -> Any:
+        hidden = bool((segment.status == UNKNOWN).any())
+        asked.append((self, "look", hidden, how is not None and how(1)[1]))
+        return SimpleNamespace(object_id=1, _view=SimpleNamespace(observation=hidden))
+
+    def infer(key: Any, model: Any, observation: Any, config: Any, *, before: Any, stages: int) -> Any:
+        asked.append(("sample", observation, before))
+        return SimpleNamespace(result=then), None
+
     monkeypatch.setattr(Tracker, "update", update)
-    monkeypatch.setattr("perception.warm._go_on", lambda trial, *_: asked.append(trial))
+    monkeypatch.setattr(Tracker, "look", look)
+    monkeypatch.setattr("perception.warm.infer", infer)
     return Tracker(Prior(ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {}, "x"), seed=3), asked
 
 
-def test_another_tracker_of_the_same_settings_looks_and_looks_again(
+def test_another_tracker_of_the_same_settings_looks_and_looks_again_and_at_the_object_half_hidden(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     tracker, asked = _tracker(monkeypatch, "stages")
@@ -45,15 +59,17 @@ def test_another_tracker_of_the_same_settings_looks_and_looks_again(
         assert gc.get_freeze_count() > before  # what is there is no longer looked through
     finally:
         gc.unfreeze()
-    assert len(asked) == 4 and asked[0] is asked[1] and asked[2] is asked[3] and asked[0] is not asked[2]
-    for trial in asked:
-        assert trial is not tracker and trial.prior is tracker.prior and trial.seed == 3
-        assert trial.config == tracker.config
-        assert trial._tracks is not tracker._tracks and trial._names is not tracker._names
+    trial = asked[0][0]
+    assert trial is not tracker and trial.prior is tracker.prior and trial.seed == 3
+    assert trial.config == tracker.config and not tracker._tracks and trial._names is not tracker._names
+    assert asked[:3] == [(trial, "update", False), (trial, "look", False, False), ("sample", False, "its own")]
+    assert asked[3:5] == [(trial, "look", True, True), ("sample", True, None)]  # begun anew, from the prior,
+    assert asked[5][:2] == ("sample", True) and asked[5][2].result == "stages"  # and gone on with
 
 
-def test_a_ctrl_c_that_the_sampler_took_is_passed_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    tracker, _ = _tracker(monkeypatch, "interrupted")
+@pytest.mark.parametrize(("outcome", "then"), [("interrupted", "stages"), ("stages", "interrupted")])
+def test_a_ctrl_c_that_the_sampler_took_is_passed_on(monkeypatch: pytest.MonkeyPatch, outcome: str, then: str) -> None:
+    tracker, _ = _tracker(monkeypatch, outcome, then)
     with pytest.raises(KeyboardInterrupt):
         warm_up(tracker)
 
