@@ -61,6 +61,7 @@ class Answers:
         """Answer a farside_msgs/QueryRegion request. Raises ValueError in one line for what cannot be asked."""
         scene, objects = self._asked(request)
         found = query(objects, _region(request), self._frame(request.header.frame_id, objects))
+        blocked = np.array([(o, row) for o, rows in found.blocked_by.items() for row in rows], np.int64).reshape(-1, 2)
         return make(
             f"{QUERY_REGION}_Response",
             success=True,
@@ -69,6 +70,9 @@ class Answers:
             out_of_model=any(h.out_of_model for h in objects),
             p_free=found.p_free,
             p_free_se=found.p_free_se,
+            p_free_few=found.p_free_few,
+            blocked_objects=blocked[:, 0].astype(np.int32),
+            blocked_hypotheses=blocked[:, 1].astype(np.uint32),
             **{f"volume_{q}": v for q, v in found.volume_m3.items()},
             unseen_fraction=found.unseen_fraction,
             outside_fraction=found.outside_fraction,

@@ -50,6 +50,8 @@ def test_the_answer_is_that_of_query(answers: Answers) -> None:
     assert got.success and got.p_free == expected.p_free == pytest.approx(0.3)
     assert got.volume_q95 == expected.volume_m3["q95"] and got.entropy_nats == expected.entropy_nats
     assert got.unseen_fraction == expected.unseen_fraction and got.p_free_se == expected.p_free_se
+    assert got.p_free_few == expected.p_free_few and expected.blocked_by == {1: got.blocked_hypotheses.tolist()}
+    assert got.blocked_objects.tolist() == [1] * len(expected.blocked_by[1])
     assert (got.objects, got.stage, got.out_of_model) == (1, 4, False)
     assert got.stamp.sec == STAMP_NS // 10**9 and got.age == pytest.approx(time.time() - STAMP_NS / 1e9, abs=60)
     points = np.array([[0.07, 0.0, 0.0], [-0.07, 0.0, 0.0]])
@@ -110,7 +112,9 @@ def test_one_object_of_a_scene_may_be_asked() -> None:
     assert answers.query_region(ask(object_id=2, **box(*RIGHT))).p_free == pytest.approx(0.9)
     with pytest.raises(ValueError, match="ambiguous"):
         answers.query_region(ask(**box(*RIGHT)))
-    assert answers.query_region(ask("camera", **box((-1, -1, 0), (1, 1, 1)))).objects == 2
+    both = answers.query_region(ask("camera", **box((-1, -1, 0), (1, 1, 1))))
+    assert both.objects == 2
+    assert list(zip(both.blocked_objects, both.blocked_hypotheses, strict=True)) == [(1, 0), (1, 1), (2, 0), (2, 1)]
     assert answers.scene.stage == 2
     answers.update([])
     with pytest.raises(ValueError, match="there are no hypotheses yet"):
