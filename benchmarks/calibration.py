@@ -247,11 +247,15 @@ def _rows(lines: list[Line]) -> list[Row]:
 
 
 def _draw(lines: list[Line], path: Path) -> None:
-    """Per condition: reliability of every method; distribution of the posterior's ranks with its band."""
+    """Per condition: reliability of every method; distribution of the posterior's ranks with its band. Three a row."""
     conditions = [c for c in SORTS if any(line["condition"] == c for line in lines)]
-    figure = Figure(figsize=(4.6 * len(conditions), 8), layout="constrained")
-    axes = figure.subplots(2, len(conditions), squeeze=False)
-    for (top, bottom), condition in zip(axes.T, conditions, strict=True):
+    columns, rows = min(3, len(conditions)), -(-len(conditions) // 3)
+    figure = Figure(figsize=(4.6 * columns, 8 * rows), layout="constrained")
+    axes = figure.subplots(2 * rows, columns, squeeze=False)
+    pairs = [(axes[2 * r, c], axes[2 * r + 1, c]) for r in range(rows) for c in range(columns)]
+    for top, bottom in pairs[len(conditions) :]:
+        top.set_axis_off(), bottom.set_axis_off()
+    for (top, bottom), condition in zip(pairs, conditions, strict=False):
         own = [line for line in lines if line["condition"] == condition]
         _reliability(top, own)
         objects = len({line["object"] for line in own})

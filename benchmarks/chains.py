@@ -24,7 +24,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from benchmarks.methods import METHODS, VI, Method, Question, Sampled, annealed, answer, paper_schedule, settings_of
-from benchmarks.results import Line, append_line, key, newest, read_lines
+from benchmarks.results import Line, append_line, key, newest, read_lines, refuse_cut
 from benchmarks.rows import Row
 from benchmarks.scene import GRID, vessel_view
 from benchmarks.stability import pictures
@@ -123,8 +123,7 @@ def _measure(prior: Prior, compared: Sequence[Method], n: int, seed: int, result
                 continue
             question = Question(view, prior, config, seed)
             found, sampled, _ = answer(method, question)
-            if found.result == "interrupted":
-                raise KeyboardInterrupt
+            refuse_cut(found.result)
             volumes = (found.shapes & ~view.seen).reshape(-1, GRID**3).sum(axis=1).astype(np.float64)
             line["unexplained"] = [round(u, 4) for u in unexplained(question, sampled)]
             line["volume_sd"] = round(relative_spread(volumes, found.weights), 4)

@@ -27,7 +27,7 @@ import numpy as np
 from benchmarks.frontier_chart import draw_frontier
 from benchmarks.kernel import matrix_speed
 from benchmarks.methods import CONDITIONS, DEPTHS, FULL, METHODS, Method, Question, answer, settings_of
-from benchmarks.results import Line, append_line, key, newest, read_lines
+from benchmarks.results import Line, append_line, key, newest, read_lines, refuse_cut
 from benchmarks.rows import Row
 from benchmarks.scene import base_rate, vessel_picture, vessel_view
 from benchmarks.score import BOXES, picture_psnr, random_boxes, score
@@ -161,15 +161,13 @@ def _one(method: Method, question: Question, rate: np.ndarray, depth: str, warm:
     """One method's answer to one view, measured. Raises KeyboardInterrupt where the sampler met Ctrl-C."""
     sizes = (method.programs or method.name, depth, question.likelihood.lattice.crossings, *question.likelihood.packed)
     if sizes not in warm:
-        if answer(method, question, short=True)[0].result == "interrupted":
-            raise KeyboardInterrupt
+        refuse_cut(answer(method, question, short=True)[0].result)
         warm.add(sizes)
     speed = matrix_speed(2048)
     # anew: what a question keeps of its observation is part of the time
     question = Question(question.view, question.prior, question.config, question.seed)
     found, sampled, positions = answer(method, question)
-    if found.result == "interrupted":
-        raise KeyboardInterrupt
+    refuse_cut(found.result)
     view = question.view
     rng = np.random.default_rng([question.seed, view.seed, 31])
     boxes = random_boxes(scored_voxels(view.seen, rate), BOXES, rng)

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
-from benchmarks.results import Line, append_line, key, newest, read_lines
+from benchmarks.results import Line, append_line, key, newest, read_lines, refuse_cut
 from benchmarks.rows import Row
 from benchmarks.scene import GRID, VesselPicture, VesselView, base_rate, vessel_view
 from benchmarks.summary import mean_rows, say, table
@@ -64,6 +64,7 @@ def second_answer(
     frame = sense(render(scene, picture.camera, T_world_camera), picture.camera, T_world_camera, seed)
     own = replace(tracker, _tracks=dict(tracker._tracks), _names=set(tracker._names))
     found = own.update(frame, segment(frame, 1)[0], stages=STAGES)
+    refuse_cut(found.hypotheses.result)
     return found.hypotheses, found.change
 
 
@@ -141,6 +142,7 @@ def _measured(
         return round(hidden_nll(p, rate, view.solid, scored), 5)
 
     first = tracker.update(view.frame, view.segment, stages=STAGES).hypotheses
+    refuse_cut(first.result)
     lines: dict[str, Line] = {NONE: {"hidden_nll": judged(first), "gain": 0.0, "change": "new"}}
     for who, (T, gain) in places(first, np.random.default_rng([seed, view.seed, 61])).items():
         h, change = second_answer(tracker, view, picture, T, seed=view.seed + 1)

@@ -31,7 +31,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.faults import noise_frame
 from benchmarks.mesh import mesh_view
-from benchmarks.results import Line, append_line, key, newest, read_lines
+from benchmarks.results import Line, append_line, key, newest, read_lines, refuse_cut
 from benchmarks.rows import Row
 from benchmarks.scene import GRID, VesselView, base_rate, vessel_view
 from benchmarks.score import BOXES, Answer, as_queried, random_boxes, score
@@ -126,6 +126,7 @@ def _answered(
 ) -> dict[str, Any]:
     """What is kept of one answer: the checks, and boxes before and after caution. ValueError: nothing to score."""
     found = estimate(view.frame, view.segment, prior, config, seed=seed, stages=240)
+    refuse_cut(found.hypotheses.result)
     h, scored = found.hypotheses, scored_voxels(view.seen, rate)
     if not scored.any():
         raise ValueError("nothing unseen")

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
+from benchmarks.results import refuse_cut
 from benchmarks.rows import Row
 from benchmarks.scene import GRID, VesselView, base_rate
 from benchmarks.score import random_boxes
@@ -100,6 +101,7 @@ def main(out: Path, quick: bool = False, prior: Path | None = None, n: int = 40,
     for number, view in views(ANY, n, lambda _: False):
         assert view is not None
         h = estimate(view.frame, view.segment, loaded, seed=seed, stages=240).hypotheses
+        refuse_cut(h.result)
         every.append(judged(view, h, rate, np.random.default_rng([seed, number, 71])))
         found = {way: scores(p, every[-1][1])["brier"] for way, p in every[-1][0].items()}
         say(f"{len(every)}, object {number}: brier " + ", ".join(f"{way} {v:.3f}" for way, v in found.items()))

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
+from benchmarks.results import refuse_cut
 from benchmarks.rows import Row
 from benchmarks.scene import GRID, VesselView
 from benchmarks.summary import say, table
@@ -173,6 +174,7 @@ def main(
     for number, view in views(ANY, n, lambda _: False):
         assert view is not None
         h = estimate(view.frame, view.segment, loaded, seed=seed, stages=240).hypotheses
+        refuse_cut(h.result)
         by_object.append(tasks_of(belief_of(view, h), each, np.random.default_rng([seed, number, 53])))
         said = {b: np.mean([t.outcome(b, LEAST)[0] for t in by_object[-1]] or [0.0]) for b in BELIEFS}
         say(

@@ -35,8 +35,15 @@ def read_lines(path: Path) -> list[Line]:
     return lines
 
 
+def refuse_cut(result: str) -> None:
+    """Raises KeyboardInterrupt where one ended an answer, which the sampler keeps for itself: it is no measurement."""
+    if result == "interrupted":
+        raise KeyboardInterrupt
+
+
 def append_line(path: Path, line: Line) -> None:
-    """Append one line and wait until it is on disk."""
+    """Append one line and wait until it is on disk; not one whose `result` was cut (`refuse_cut`)."""
+    refuse_cut(line.get("result", ""))
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab") as file:
         file.write(json.dumps(line, allow_nan=False).encode() + b"\n")

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from benchmarks.results import refuse_cut
 from benchmarks.scene import GRID, VesselView
 from benchmarks.score import Answer
 from perception.controller import ControllerConfig, estimate
@@ -56,6 +57,7 @@ def answers(
             vessel.frame, vessel.segment, prior, config, seed=seed, known=known, budget_s=budget_s, stages=stages
         )
         h = found.hypotheses
+        refuse_cut(h.result)
         result[POSTERIOR] = Answer(coarsen(h.solid, GRID), h.weights, found.seconds, h.result)
     observation, cube = observe(vessel.frame, vessel.segment, config.observe, seed, vessel.cube)
     picture = encoder_picture(vessel, cube, prior)

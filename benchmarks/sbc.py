@@ -211,7 +211,8 @@ def _draw(found: dict[str, dict[str, np.ndarray]], path: Path) -> None:
         at, low, high = uniform_band(len(next(iter(by.values()))))
         ax.fill_between(at, low - at, high - at, color="0.85", label="95% of uniform samples")
         for statistic, u in by.items():
-            ax.plot(at, np.mean(u[:, None] <= at, axis=0) - at, label=statistic, linewidth=1.2)
+            share = np.mean(u[:, None] <= at, axis=0)
+            ax.plot(at, share - at, color=f"C{STATISTICS.index(statistic)}", label=statistic, linewidth=1.2)
         ax.axhline(0.0, color="k", linewidth=0.6)
         ax.set(title=name, xlabel="rank of the truth")
         ax.title.set_fontsize(9)

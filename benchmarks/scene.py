@@ -9,8 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
+from perception.monocular import PlaneGuess
 from perception.observe import ObjectFrame, ObserveConfig, object_frame
 from perception.seen import seen_voxels
 from perception.segment import Segment, segment
@@ -97,12 +99,10 @@ def vessel_picture(seed: int, handle: Handle, config: ViewConfig | None = None) 
     camera = simulated_camera(config)
     for _ in range(config.tries):
         placed, T_world_camera = place(seed, rng, config)
-        T_object_camera = np.linalg.inv(placed.T_world_object) @ T_world_camera
-        T_object_camera[:3, 3] /= placed.half_extent
-        if _shows_handle(shape, T_object_camera) != (handle == "informative"):  # a small picture costs less
+        if shows_handle(placed, T_world_camera) != (handle == "informative"):  # a small picture costs less
             continue
         view = VesselPicture(placed, camera, T_world_camera, render(Scene((placed,)), camera, T_world_camera))
-        pixels, total = _pixels_of_handle(view), int((view.picture.label == 1).sum())
+        pixels, total = pixels_of_handle(view), int((view.picture.label == 1).sum())
         if handle == "hidden" and total >= config.least and not pixels:
             return view
         if handle == "informative" and pixels >= max(config.shown, config.shown_share * total):
@@ -119,14 +119,16 @@ def vessel_view(
     """What perception makes of a picture through a faulty sensor, with the truth in the cube that it chose.
 
     A `fault` is done to the frame on top of the sensor's; what is truly seen and there stays what it is. Without
-    `depth` the segment is the true mask's, on the plane that the camera's pose over the table gives (with
-    `PlaneGuess`'s errors of it): what a user has to say of a picture; only what is beside the outline counts as seen.
+    `depth` the segment is the true mask's, on the plane that a camera's pose over the table gives which errs as much as
+    `PlaneGuess` states (`told_pose`): what a user has to say of a picture; only what is beside the outline counts as
+    seen.
     With `pose_known` the cube is the object's own, as a marker on it would tell. Raises ValueError where perception
     refuses.
     """
     placed, camera, seed = picture.placed, picture.camera, picture.placed.seed
     frame = sense(picture.picture, camera, picture.T_world_camera, seed)
-    frame = frame if depth else replace(frame, depth=None)
+    if not depth:
+        frame = replace(frame, depth=None, T_world_camera=told_pose(picture.T_world_camera, seed))
     frame = frame if fault is None else fault(frame)
     found = segment(frame, 1)[0]
     if pose_known:
@@ -151,6 +153,15 @@ def vessel_view(
         near_handle=swept & ~coarsen(body, GRID),
         pose_known=pose_known,
     )
+
+
+def told_pose(T_world_camera: Float[np.ndarray, "4 4"], seed: int) -> Float[np.ndarray, "4 4"]:
+    """A camera's pose as its user tells it: height and tilt err by what `PlaneGuess` states, drawn by the seed."""
+    stated, rng = PlaneGuess(), np.random.default_rng([seed, 53])
+    told = T_world_camera.copy()
+    told[2, 3] += rng.normal(0.0, stated.height_sigma)
+    told[:3, :3] @= Rotation.from_euler("x", rng.normal(0.0, stated.tilt_sigma), degrees=True).as_matrix()
+    return told
 
 
 def hidden_vessel(seed: int, config: ViewConfig | None = None) -> VesselView | None:
@@ -188,15 +199,17 @@ def stand(
     return place_camera(tuple(position), tuple(target))
 
 
-def _shows_handle(obj: TabletopObject, T_object_camera: Float[np.ndarray, "4 4"], size: int = 96) -> bool:
-    """Whether a picture of the whole object, in canonical cube units, shows its handle."""
+def shows_handle(placed: Placed, T_world_camera: Float[np.ndarray, "4 4"], size: int = 96) -> bool:
+    """Whether a small picture of the whole object shows its handle."""
+    T_object_camera = np.linalg.inv(placed.T_world_object) @ T_world_camera
+    T_object_camera[:3, 3] /= placed.half_extent
     distance = float(np.linalg.norm(T_object_camera[:3, 3]))
     origin, direction = pinhole_rays(T_object_camera, 0.5 * size * distance / 1.5, size)
-    hit, length, _ = (np.asarray(a) for a in trace(obj, origin, direction))
-    return bool(np.any(_on_handle(obj, origin + np.where(hit, length, 0.0)[:, None] * direction)[hit]))
+    hit, length, _ = (np.asarray(a) for a in trace(placed.shape, origin, direction))
+    return bool(np.any(_on_handle(placed.shape, origin + np.where(hit, length, 0.0)[:, None] * direction)[hit]))
 
 
-def _pixels_of_handle(view: VesselPicture) -> int:
+def pixels_of_handle(view: VesselPicture) -> int:
     """How many pixels of the faultless picture show the handle."""
     v, u = np.nonzero(view.picture.label == 1)
     rays = view.camera.rays(np.column_stack([u, v]))

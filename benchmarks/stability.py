@@ -21,7 +21,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from benchmarks.faults import AXES, Axis
-from benchmarks.results import Line, append_line, key, read_lines
+from benchmarks.results import Line, append_line, key, read_lines, refuse_cut
 from benchmarks.rows import Row
 from benchmarks.scene import VesselPicture, base_rate, vessel_view
 from benchmarks.score import BOXES, as_queried, random_boxes, score
@@ -72,6 +72,7 @@ def look(
             return Seen(None, True, refused=str(error))
         return Seen(None, False, broken=f"{type(error).__name__}: {error}")  # what must not be
     h = found.hypotheses
+    refuse_cut(h.result)
     rng = np.random.default_rng([seed, view.seed, 31])
     scored = scored_voxels(view.seen, rate)
     if not scored.any():  # the cube is elsewhere

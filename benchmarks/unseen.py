@@ -5,6 +5,8 @@
 - any view, colour only: the same without depth; the plane is the one that the camera's pose gives.
 - any view, pose known: the same, in the object's own cube, as a marker on it would tell it.
 - half hidden: as any view, with a carton before them that hides 35 to 65% of their pixels.
+- no handle in sight: as any view, cups, mugs and pitchers of which no pixel shows a handle; whether one is behind, the
+  view leaves open, and nothing was picked by it.
 - handle hidden: vessels whose handle no pixel shows. They are selected by a truth that the view leaves open (every one
   has a handle): even a right posterior errs here, towards no handle.
 """
@@ -14,26 +16,49 @@ from functools import partial
 from itertools import count
 
 import numpy as np
+from jaxtyping import Float
 
 from benchmarks.occluded import carton_seeds, half_hidden
-from benchmarks.scene import VesselPicture, VesselView, ViewConfig, place, simulated_camera, vessel_picture, vessel_view
-from perception.simulate import Scene, render
+from benchmarks.scene import (
+    VesselPicture,
+    VesselView,
+    ViewConfig,
+    pixels_of_handle,
+    place,
+    shows_handle,
+    simulated_camera,
+    vessel_picture,
+    vessel_view,
+)
+from perception.simulate import Placed, Scene, render
+from probnerf.families.draw import CUP, MUG, PITCHER
 from probnerf.families.tabletop import TEST_SEEDS
 
 ANY, COLOUR, KNOWN = "any view", "any view, colour only", "any view, pose known"
-HALF, HANDLE = "half hidden", "handle hidden"
+HALF, BEHIND, HANDLE = "half hidden", "no handle in sight", "handle hidden"
 
 
 def any_view(seed: int) -> VesselPicture:
     """The object of a family seed from a random camera."""
-    config = ViewConfig()
-    placed, T = place(seed, np.random.default_rng([seed, 47]), config)
-    camera = simulated_camera(config)
+    placed, T = _stand(seed)
+    camera = simulated_camera(ViewConfig())
     return VesselPicture(placed, camera, T, render(Scene((placed,)), camera, T))
+
+
+def _stand(seed: int) -> tuple[Placed, Float[np.ndarray, "4 4"]]:
+    return place(seed, np.random.default_rng([seed, 47]), ViewConfig())
 
 
 def _half(seed: int) -> VesselPicture | None:
     return half_hidden(seed, next(carton_seeds(range(seed + 1, seed + 1000))))
+
+
+def _no_handle_in_sight(seed: int) -> VesselPicture | None:
+    placed, T = _stand(seed)
+    if placed.shape.kind not in (CUP, MUG, PITCHER) or shows_handle(placed, T):  # a small picture costs less
+        return None
+    picture = any_view(seed)
+    return None if pixels_of_handle(picture) else picture
 
 
 # of each condition: where among the test seeds it begins, and its picture; only those of one begin share objects
@@ -42,6 +67,7 @@ SORTS: dict[str, tuple[int, Callable[[int], VesselPicture | None]]] = {
     COLOUR: (0, any_view),
     KNOWN: (0, any_view),
     HALF: (2000, _half),
+    BEHIND: (6000, _no_handle_in_sight),
     HANDLE: (4000, partial(vessel_picture, handle="hidden")),
 }
 

@@ -10,6 +10,8 @@ from benchmarks.calibration import _answered_by_all, _settings, called_free, poo
 from benchmarks.results import append_line
 from benchmarks.rivals import METHODS, POSTERIOR, RivalConfig
 from benchmarks.sbc import CONDITIONS, STATISTICS, identity, main, outside, ranks_of
+from benchmarks.scene import pixels_of_handle
+from benchmarks.unseen import BEHIND, SORTS
 from perception.controller import ControllerConfig
 from probnerf.metrics import ECE_BINS, uniform_band
 
@@ -43,6 +45,16 @@ def test_rivals_answers_outlast_a_change_of_the_sampler_and_are_shown_beside_the
     lines = [{"condition": "any view", "object": n, "method": m} for n in (1, 2) for m in METHODS]
     lines = [line for line in lines if (line["object"], line["method"]) != (2, POSTERIOR)]
     assert {line["object"] for line in _answered_by_all(lines)} == {1}
+
+
+def test_views_with_no_handle_in_sight_are_picked_by_what_is_seen_alone() -> None:
+    """One with a handle behind and one without; none that shows its handle, and no can."""
+    picture_of = SORTS[BEHIND][1]
+    for seed, has_handle in ((1000047, True), (1000009, False)):
+        picture = picture_of(seed)
+        assert picture is not None and not pixels_of_handle(picture)
+        assert bool(picture.placed.shape.has_handle) == has_handle
+    assert picture_of(1000003) is None and picture_of(1000000) is None
 
 
 @pytest.mark.parametrize("n", [20, 200])

@@ -67,6 +67,14 @@ def test_a_last_line_that_was_cut_is_dropped_and_another_one_is_an_error(tmp_pat
         read_lines(file)
 
 
+def test_an_answer_that_was_cut_is_not_kept(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        append_line(tmp_path / "results.jsonl", {"result": "interrupted"})
+    assert not list(tmp_path.iterdir())
+    append_line(tmp_path / "results.jsonl", {"result": "converged"})
+    assert (tmp_path / "results.jsonl").read_text() == '{"result": "converged"}\n'
+
+
 def test_the_order_of_settings_makes_no_other_result():
     assert key(LINE) == key({**LINE, "settings": {"b": 2, "a": 1}})
     assert key(LINE) != key({**LINE, "settings": {"b": 2, "a": 2}})

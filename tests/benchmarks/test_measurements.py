@@ -18,10 +18,11 @@ from benchmarks.frame import (
 from benchmarks.hidden import judge
 from benchmarks.prior import VIEWS, see
 from benchmarks.rivals import METHODS, POSTERIOR
-from benchmarks.scene import base_rate, hidden_vessel, vessel_picture, vessel_view
+from benchmarks.scene import base_rate, hidden_vessel, told_pose, vessel_picture, vessel_view
 from benchmarks.score import Answer, random_boxes
 from benchmarks.summary import mean_rows
 from perception.controller import ControllerConfig, estimate
+from perception.monocular import PlaneGuess
 from perception.plane import heights
 from perception.segment import segment
 from perception.source import read_frame_folder
@@ -87,6 +88,21 @@ def test_without_depth_what_counts_as_seen_tells_nothing_of_where_the_surface_is
     u, v = np.round(view.frame.camera.project(camera)).astype(int).T
     on_object = view.segment.mask[v.clip(0, view.segment.mask.shape[0] - 1), u.clip(0, view.segment.mask.shape[1] - 1)]
     assert not view.seen.ravel()[on_object].any() and on_object.sum() > 2 * view.solid.sum()
+
+
+def test_without_depth_the_camera_s_pose_errs_as_much_as_is_stated():
+    exact = np.eye(4)
+    told = np.stack([told_pose(exact, seed) for seed in range(500)])
+    tilt = np.degrees(np.arctan2(told[:, 2, 1], told[:, 2, 2]))
+    stated = PlaneGuess()
+    assert np.std(told[:, 2, 3]) == pytest.approx(stated.height_sigma, rel=0.1)
+    assert np.std(tilt) == pytest.approx(stated.tilt_sigma, rel=0.1)
+    assert np.abs([told[:, 2, 3].mean() / stated.height_sigma, tilt.mean() / stated.tilt_sigma]).max() < 0.15
+    picture = vessel_picture(2_000_001, "hidden")
+    assert picture is not None
+    supposed = vessel_view(picture, depth=False).frame.T_world_camera
+    np.testing.assert_array_equal(supposed, told_pose(picture.T_world_camera, 2_000_001))
+    np.testing.assert_array_equal(vessel_view(picture).frame.T_world_camera, picture.T_world_camera)
 
 
 def test_what_the_camera_saw_as_free_is_not_solid(vessel):
