@@ -10,6 +10,8 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # Set before anything imports jax, which reads them once; they reach the processes that tests start, too.
 os.environ["JAX_PLATFORMS"] = "cpu"
+# Importing JAX sets it to 1 for all that tests start; jaxlib 0.10.1 then says 200 KB of its own kept programs.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 signal.signal(

@@ -80,7 +80,11 @@ def test_a_driver_the_node_and_a_planner_in_three_processes(tmp_path: Path) -> N
     options = ["--config", str(config), "--prior", str(tmp_path / "tiny.safetensors")]
     live = [sys.executable, "-m", "node", "live", "topic", "--record", str(log), *options]
     driver = [sys.executable, "-m", "tests.node.driver", endpoint, str(SHIPPED_LOG), "10"]
-    with subprocess.Popen(live, cwd=ROOT, stdout=PIPE, stderr=PIPE, text=True) as node:
+    errors = tmp_path / "errors"  # a file: a pipe that nobody reads would fill and stop the node
+    with (
+        errors.open("w") as stderr,
+        subprocess.Popen(live, cwd=ROOT, stdout=PIPE, stderr=stderr, text=True) as node,
+    ):
         try:
             assert "is up" in node.stdout.readline()
             with (
@@ -106,7 +110,7 @@ def test_a_driver_the_node_and_a_planner_in_three_processes(tmp_path: Path) -> N
                 camera.kill()
             node.send_signal(signal.SIGINT)
             said = node.stdout.read()
-            assert node.wait(60.0) == 0, node.stderr.read()
+            assert node.wait(60.0) == 0, errors.read_text()
         finally:
             node.kill()
     received, _, inferred = (int(n) for n in re.search(r"(\d+) frames, (\d+) looked at, (\d+) inferred", said).groups())
