@@ -13,10 +13,8 @@ cover anything: MAP has none.
 Results are appended to a file, object by object, and what is there is not made again.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +24,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from benchmarks.methods import PAPER, VI, Question, answer, settings_of
-from benchmarks.results import Line, append_line, key, newest, read_lines
+from benchmarks.results import Line, append_line, digest, key, newest, read_lines
 from benchmarks.rivals import MAP, METHODS, POSTERIOR, RivalConfig, answers
 from benchmarks.rows import Row
 from benchmarks.scene import VesselView, base_rate
@@ -164,13 +162,12 @@ def _settings(config: ControllerConfig, rivals: RivalConfig, quick: bool) -> dic
     """What each method's answers depend on. The rivals' outlast a change of the sampler."""
     shared = [asdict(likelihood_settings(config.infer)), asdict(config.observe), config.grid, config.hypotheses]
 
-    def digest(*told: object) -> Line:
-        text = json.dumps(told, sort_keys=True, default=str)
-        return {"digest": sha256(text.encode()).hexdigest()[:12] + "-quick" * quick}  # a base rate of fewer objects
+    def told(*settings: object) -> Line:
+        return {"digest": digest(settings, quick)}
 
     sampler = asdict(config)
     del sampler["out_of_model_below"]  # what is judged here are the hypotheses, flagged or not
-    own = {m: digest(sampler) if m == POSTERIOR else digest(shared, asdict(rivals)) for m in METHODS}
+    own = {m: told(sampler) if m == POSTERIOR else told(shared, asdict(rivals)) for m in METHODS}
     return {**own, **{m: settings_of(method, config) for m, method in SLOW.items()}}
 
 

@@ -7,12 +7,10 @@ none, only evaluations; starts of the sampler are evaluated as well, which only 
 same pixels, likelihood and prior.
 """
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from hashlib import sha256
 from typing import Any
 
 import jax
@@ -20,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks.results import Line
+from benchmarks.results import Line, digest
 from benchmarks.rivals import RivalConfig, encoder_alone, encoder_picture
 from benchmarks.scene import GRID, VesselView
 from benchmarks.score import Answer
@@ -277,8 +275,7 @@ def settings_of(method: Method, config: ControllerConfig) -> Line:
     own = ("smc", "smc_from_prior", "modes")  # of the sampler, which other methods do not have
     infer = {name: value for name, value in asdict(config.infer).items() if method.smc or name not in own}
     shared = {"infer": infer, "observe": asdict(config.observe), "hypotheses": config.hypotheses}
-    digest = sha256(json.dumps(shared, sort_keys=True, default=str).encode()).hexdigest()[:8]
-    return {**method.settings, "config": digest}
+    return {**method.settings, "config": digest(shared)[:8]}
 
 
 def answer(method: Method, question: Question, short: bool = False) -> tuple[Answer, Sampled, Float[Array, "S d"]]:

@@ -13,16 +13,14 @@ did not see, by the true geometry, smoothed as everywhere. Results are appended 
 there is not made again.
 """
 
-import json
 from dataclasses import asdict, replace
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
-from benchmarks.results import Line, append_line, key, newest, read_lines, refuse_cut
+from benchmarks.results import Line, append_line, digest, key, newest, read_lines, refuse_cut
 from benchmarks.rows import Row
 from benchmarks.scene import GRID, VesselPicture, VesselView, base_rate, vessel_view
 from benchmarks.summary import mean_rows, say, table
@@ -100,9 +98,8 @@ def main(
     if quick:
         n, results = min(n, 2), out / "next_view.jsonl" if results == RESULTS else results
     loaded, config = load_prior(prior), ControllerConfig()
-    told = json.dumps(asdict(config), sort_keys=True, default=str)
-    digest = sha256(told.encode()).hexdigest()[:12] + "-quick" * quick
-    common = {"prior": loaded.hash, "settings": {"digest": digest}, "seed": seed, "condition": "any view"}
+    settings = {"digest": digest(asdict(config), quick)}
+    common = {"prior": loaded.hash, "settings": settings, "seed": seed, "condition": "any view"}
     if not only_chart:
         done = {key(line) for line in read_lines(results)}
         rate = base_rate(128 if quick else 1024, config=config.observe)

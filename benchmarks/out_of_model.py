@@ -21,7 +21,6 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.faults import noise_frame
 from benchmarks.mesh import mesh_view
-from benchmarks.results import Line, append_line, key, newest, read_lines, refuse_cut
+from benchmarks.results import Line, append_line, digest, key, newest, read_lines, refuse_cut
 from benchmarks.rows import Row
 from benchmarks.scene import GRID, VesselView, base_rate, vessel_view
 from benchmarks.score import BOXES, Answer, as_queried, random_boxes, score
@@ -78,10 +77,8 @@ def main(
     if quick:
         n, noise, results = min(n, 1), min(noise, 1), out / "out_of_model.jsonl" if results == RESULTS else results
     loaded, config = load_prior(prior), ControllerConfig()
-    digest = (
-        sha256(json.dumps(asdict(config), sort_keys=True, default=str).encode()).hexdigest()[:12] + "-quick" * quick
-    )
-    common = {"prior": loaded.hash, "method": "tempered_smc", "settings": {"digest": digest}, "seed": seed}
+    settings = {"digest": digest(asdict(config), quick)}
+    common = {"prior": loaded.hash, "method": "tempered_smc", "settings": settings, "seed": seed}
     if not only_chart:
         done = {key(line) for line in read_lines(results)}
         rate = base_rate(128 if quick else 1024, config=config.observe)

@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Iterable
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,11 @@ KEY = ("prior", "method", "settings", "condition", "object", "seed")  # what mak
 def key(line: Line) -> tuple[str, ...]:
     """A line's identity, whatever the order of its settings."""
     return tuple(json.dumps(line[name], sort_keys=True) for name in KEY)
+
+
+def digest(told: object, quick: bool = False) -> str:
+    """Settings in twelve characters; those of a quick run (a base rate of fewer objects) are others."""
+    return sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()[:12] + "-quick" * quick
 
 
 def read_lines(path: Path) -> list[Line]:

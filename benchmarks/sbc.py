@@ -18,10 +18,8 @@ outside: how far the ranks' distribution function leaves the band that 95% of un
 Ranks are appended to a file, draw by draw, and what is there is not made again.
 """
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from hashlib import sha256
 from pathlib import Path
 
 import jax
@@ -30,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 
-from benchmarks.results import Line, append_line, key, read_lines
+from benchmarks.results import Line, append_line, digest, key, read_lines
 from benchmarks.rows import Row
 from benchmarks.summary import say, table
 from probnerf.analytic import draw_pixels, grid_of_rays
@@ -137,8 +135,8 @@ def identity(condition: Condition, prior: str) -> Line:
     """What makes a draw of this condition the same one, but for its number."""
     told = {"sampler": asdict(condition.sampler), "infer": asdict(_settings(condition)), "pose": condition.pose}
     told |= {"pixels": [condition.columns, condition.rows], "grid": GRID, "draws": DRAWS, "widths": POSE_SIGMA}
-    digest = sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()[:12]
-    same = {"method": "tempered_smc", "condition": condition.name, "settings": {"digest": digest}, "seed": 0}
+    settings = {"digest": digest(told)}
+    same = {"method": "tempered_smc", "condition": condition.name, "settings": settings, "seed": 0}
     return {"prior": "" if condition.model is CylinderModel else prior, **same}
 
 

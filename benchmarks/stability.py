@@ -10,10 +10,8 @@ broken: there must be none.
 Answers are appended to a file as they come, and what is there is not made again.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +19,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from benchmarks.faults import AXES, Axis
-from benchmarks.results import Line, append_line, key, read_lines, refuse_cut
+from benchmarks.results import Line, append_line, digest, key, read_lines, refuse_cut
 from benchmarks.rows import Row
 from benchmarks.scene import VesselPicture, base_rate, vessel_view
 from benchmarks.score import BOXES, as_queried, random_boxes, score
@@ -113,9 +111,8 @@ def main(
     if not chosen:
         raise ValueError(f"no axis begins with {axes!r}; there are: {'; '.join(a.name for a in AXES)}")
     loaded, rate = load_prior(prior), base_rate(128 if quick else 1024)
-    told = json.dumps(asdict(ControllerConfig()), sort_keys=True, default=str)
-    digest = sha256(told.encode()).hexdigest()[:12] + "-quick" * quick
-    same = {"prior": loaded.hash, "method": "tempered_smc", "settings": {"digest": digest}}
+    settings = {"digest": digest(asdict(ControllerConfig()), quick)}
+    same = {"prior": loaded.hash, "method": "tempered_smc", "settings": settings}
     done = {key(line): line for line in read_lines(results)}
 
     def answered(picture: VesselPicture, axis: Axis, amount: float, seed: int) -> Seen | None:
