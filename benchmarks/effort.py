@@ -115,7 +115,7 @@ def main(out: Path, quick: bool = False, prior: Path | None = None, n: int = 8, 
     for condition in CONDITIONS:
         for view in scenes(condition, n):
             if not warm:  # once
-                measured(view, replace(config, particles=1))
+                measured(view, replace(config, runs=1))
                 warm = True
             got = {method: measured(view, amount) for method, amount in amounts.items()}
             values = {method: values for method, (values, _) in got.items()}

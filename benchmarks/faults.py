@@ -144,7 +144,7 @@ def _particles(config: ControllerConfig, amount: float) -> ControllerConfig:
 
     own = config.infer
     infer = replace(own, smc=fewer(own.smc), smc_from_prior=fewer(own.smc_from_prior))
-    return replace(config, infer=infer, particles=max(1, int(config.particles * amount)))
+    return replace(config, infer=infer)
 
 
 def _rays(config: ControllerConfig, amount: float) -> ControllerConfig:

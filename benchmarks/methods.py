@@ -192,12 +192,12 @@ def _estimate(
     budget_s: float | None = None,
     infer: dict[str, Any] | None = None,
     smc: dict[str, Any] | None = None,
-    particles: int | None = 1,
+    runs: int | None = 1,
     conditions: tuple[str, ...] = CONDITIONS,
 ) -> Method:
     """Perception's own way, with other numbers of `InferConfig` and of its `smc`.
 
-    `particles` of all runs together (of one: 1), or with None the controller's own choice.
+    So many `runs`, or with None the controller's own choice.
     """
 
     def sample(q: Question, short: bool) -> Sampled:
@@ -207,8 +207,8 @@ def _estimate(
         sampler = replace(own, **(infer or {}), **populations)
         limits = {"stages": None if stages is None else 2} if short else {"stages": stages, "budget_s": budget_s}
         config = replace(q.config, infer=sampler)
-        if particles is not None:
-            config = replace(config, particles=particles, unexplained=1.0, tolerance=0.0)
+        if runs is not None:
+            config = replace(config, runs=runs, unexplained=1.0, tolerance=0.0)
         begun = time.monotonic()
         found = estimate(q.view.frame, q.view.segment, q.prior, config, seed=q.seed, **limits)
         seconds = time.monotonic() - begun
@@ -217,9 +217,9 @@ def _estimate(
         return Sampled(found.posterior, found.observation, likelihood, cube, float(gradients), seconds=seconds)
 
     ours = ControllerConfig()
-    amount: dict[str, Any] = {"particles": particles}
-    if particles is None:
-        amount = {"particles": ours.particles, "unexplained": ours.unexplained, "tolerance": ours.tolerance}
+    amount: dict[str, Any] = {"runs": runs}
+    if runs is None:
+        amount = {"runs": ours.runs, "unexplained": ours.unexplained, "tolerance": ours.tolerance}
     settings = {"stages": stages, "budget_s": budget_s, **amount, **(infer or {}), **(smc or {})}
     programs = "" if budget_s is None else group  # one budget compiles what another needs
     return Method(name, group, label, sample, settings, conditions, programs, smc=True)
@@ -242,8 +242,8 @@ METHODS = (
     PAPER,
     _hmc("fixed", "fixed temperature", replace(annealed(20, 100), s_start=0.1), TELLING),
     _estimate("smc", "smc", "x1", stages=60),
-    _estimate("smc, 3 runs", "smc", "x3", stages=180, particles=192, conditions=TELLING),
-    _estimate("smc, 6 runs", "smc", "x6", stages=360, particles=384, conditions=TELLING),
+    _estimate("smc, 3 runs", "smc", "x3", stages=180, runs=3, conditions=TELLING),
+    _estimate("smc, 6 runs", "smc", "x6", stages=360, runs=6, conditions=TELLING),
     _estimate(
         "smc, from the prior",
         "lever off",
@@ -266,7 +266,7 @@ METHODS = (
         smc={"leapfrog_steps": 6},
         conditions=TELLING,
     ),
-    *(_estimate(f"controller {s:g} s", "controller", f"{s:g} s", budget_s=s, particles=None) for s in (1.0, 3.0, 10.0)),
+    *(_estimate(f"controller {s:g} s", "controller", f"{s:g} s", budget_s=s, runs=None) for s in (1.0, 3.0, 10.0)),
 )
 
 

@@ -1,10 +1,11 @@
 """How much model a scene needs: from a frame's segment to published hypotheses, with no more than that.
 
 A run is a small sampler: a few independent populations of a few particles, which begin where climbs from the encoder's
-guesses end. Its populations tell the Monte Carlo error of what it says of unseen space. Where that is above the
-tolerance the controller makes as many further runs as should bring it down (it falls with their root), and their
-populations answer together; where the shapes leave too many pixels unexplained (a posterior-predictive check) it makes
-all it may. There is an answer to publish from the start, and a better one after each step.
+guesses end. How far its populations disagree of unseen space tells what score their small number is expected to lose
+there (`publish.expected_loss`). Where that is above the tolerance the controller makes as many further runs as should
+bring it down (it falls with their number), and their populations answer together; where the shapes leave too many
+pixels unexplained (a posterior-predictive check) it makes all it may. There is an answer to publish from the start, and
+a better one after each step.
 
 Lattice and rays are the same for every scene: with half of both, shapes were worse on easy scenes as on hard ones, and
 no check told where (`farside bench frontier` has a coarse lattice among its levers).
@@ -59,24 +60,22 @@ class ControllerConfig(PublishConfig):
     observe: ObserveConfig = field(default_factory=ObserveConfig)
     first_hypotheses: int = 8  # published while better ones are under way
     unexplained: float = 0.1  # share of pixels above which all runs are made
-    tolerance: float = 0.006  # Monte Carlo error of the mean unseen occupancy that is good enough
-    particles: int = 384  # of all runs together, at most; one run is always made
+    tolerance: float = 0.005  # nats a voxel of unseen space that having no more populations may lose
+    runs: int = 4  # at most
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if min(self.first_hypotheses, self.particles) < 1:
-            raise ValueError(
-                f"first_hypotheses {self.first_hypotheses} and particles {self.particles} must be 1 or more"
-            )
+        if min(self.first_hypotheses, self.runs) < 1:
+            raise ValueError(f"first_hypotheses {self.first_hypotheses} and runs {self.runs} must be 1 or more")
 
-    def needed(self, done: int, error: float, missed: float, most: int) -> int:
-        """How many runs the answer takes, if `done` of them leave this Monte Carlo error and share of pixels missed."""
+    def needed(self, done: int, loss: float, missed: float) -> int:
+        """How many runs the answer takes, if `done` of them leave this expected loss and share of pixels missed."""
         if missed > self.unexplained:
-            return most
-        if error <= self.tolerance:
+            return self.runs
+        if loss <= self.tolerance:
             return done
-        wanted = done * (error / self.tolerance) ** 2 if self.tolerance > 0 and np.isfinite(error) else np.inf
-        return int(min(most, max(done + 1, np.ceil(min(wanted, most)))))
+        wanted = done * loss / self.tolerance if self.tolerance > 0 and np.isfinite(loss) else np.inf
+        return int(min(self.runs, max(done + 1, np.ceil(min(wanted, self.runs)))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,11 +169,10 @@ def infer_view(
         if len(runs) > answered:
             h = work.answer = work.publish(pooled(runs, work.smc.evidence_power), config.hypotheses)
             answered, missed = len(runs), 1.0 - h.diagnostics["explained"]
-            log.append(
-                f"{work.amount(answered)}: error {h.monte_carlo_error:.3f}, {100 * missed:.0f}% of pixels not explained"
-            )
+            loss = h.diagnostics["expected_loss"]
+            log.append(f"{work.amount(answered)}: loses {loss:.4f} nats, {100 * missed:.0f}% of pixels not explained")
             if grows and short is None:
-                needed = config.needed(answered, h.monte_carlo_error, missed, work.most)
+                needed = config.needed(answered, loss, missed)
             if short is None and needed > answered:
                 log[-1] += f" -> {work.amount(needed)}"
                 short = work.short_of()
@@ -224,11 +222,6 @@ class _Work:
     def smc(self) -> TemperedSMCConfig:
         """Of one run."""
         return sampler_of(self.config.infer, self.reference, self.before)
-
-    @property
-    def most(self) -> int:
-        """Runs."""
-        return max(1, self.config.particles // (self.smc.populations * self.smc.particles))
 
     @cached_property
     def picture(self) -> Picture | None:

@@ -1,6 +1,5 @@
 """The picture that the encoder is asked about, cut out of a frame."""
 
-import jax.numpy as jnp
 import numpy as np
 
 from perception.observe import ObjectFrame
@@ -8,7 +7,7 @@ from perception.segment import Segment
 from perception.source import Frame
 from probnerf.families.render import look_at, pinhole_rays
 from probnerf.proposal import Picture
-from probnerf.types import OBJECT, UNKNOWN
+from probnerf.types import OBJECT, UNKNOWN, on_device
 from probnerf.views import ENCODER_RADIUS
 
 
@@ -33,11 +32,9 @@ def crop(frame: Frame, segment: Segment, cube: ObjectFrame, size: int) -> Pictur
     range_cube = np.where(np.isfinite(z), z, 0.0) / np.maximum(rays[:, 2], 1e-6) / cube.half_extent
     is_object = status == OBJECT
     return Picture(
-        rgb=jnp.asarray((frame.rgb[v, u] / 255.0).reshape(size, size, 3), jnp.float32),
-        distance=jnp.asarray(
-            np.where(is_object, np.where(np.isfinite(z), range_cube, -1.0), 0.0).reshape(size, size), jnp.float32
-        ),
-        unknown=jnp.asarray((status == UNKNOWN).reshape(size, size), jnp.float32),
-        T_view_camera=jnp.asarray(T_view_camera, jnp.float32),
-        tan_half_fov=jnp.asarray(tan_half, jnp.float32),
+        rgb=on_device((frame.rgb[v, u] / 255.0).reshape(size, size, 3)),
+        distance=on_device(np.where(is_object, np.where(np.isfinite(z), range_cube, -1.0), 0.0).reshape(size, size)),
+        unknown=on_device((status == UNKNOWN).reshape(size, size)),
+        T_view_camera=on_device(T_view_camera),
+        tan_half_fov=on_device(tan_half),
     )

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
@@ -13,7 +12,7 @@ from perception.monocular import standing_body
 from perception.plane import heights
 from perception.segment import Segment, backproject
 from perception.source import Frame
-from probnerf.types import BASE_Z, FREE, OBJECT, UNKNOWN, Observation, Rays
+from probnerf.types import BASE_Z, FREE, OBJECT, UNKNOWN, Observation, Rays, on_device
 
 # The larger of a body's width and height is this many cube units: the scale convention of the prior.
 BODY_EXTENT = 1.4
@@ -137,17 +136,17 @@ def observe(
     limit = np.where(occluded, np.maximum(metres - 2.0 * sigma, 0.0) / cube.half_extent, limit)
     observation = Observation(
         rays=Rays(
-            origin=jnp.asarray(np.broadcast_to(origin, (len(chosen), 3)), jnp.float32),
-            direction=jnp.asarray(np.where(real[:, None], directions[chosen], towards), jnp.float32),
+            origin=on_device(np.broadcast_to(origin, (len(chosen), 3))),
+            direction=on_device(np.where(real[:, None], directions[chosen], towards)),
         ),
-        status=jnp.asarray(kind, jnp.int32),
-        rgb=jnp.asarray(np.where(real[:, None], frame.rgb.reshape(-1, 3)[flat[chosen]] / 255.0, 0.0), jnp.float32),
-        rgb_valid=jnp.asarray(kind == OBJECT),
-        range=jnp.asarray(np.where(kind == OBJECT, metres, 0.0) / cube.half_extent, jnp.float32),
-        range_sigma=jnp.asarray(sigma / cube.half_extent, jnp.float32),
-        range_valid=jnp.asarray(measured & (kind == OBJECT)),
-        limit=jnp.asarray(limit, jnp.float32),
-        pose_sigma=jnp.asarray(
+        status=on_device(kind, np.int32),
+        rgb=on_device(np.where(real[:, None], frame.rgb.reshape(-1, 3)[flat[chosen]] / 255.0, 0.0)),
+        rgb_valid=on_device(kind == OBJECT, np.bool_),
+        range=on_device(np.where(kind == OBJECT, metres, 0.0) / cube.half_extent),
+        range_sigma=on_device(sigma / cube.half_extent),
+        range_valid=on_device(measured & (kind == OBJECT), np.bool_),
+        limit=on_device(limit),
+        pose_sigma=on_device(
             np.hypot(
                 [
                     cube.xy_sigma + cube.along_sigma,
@@ -157,8 +156,7 @@ def observe(
                     config.plane_sigma / cube.half_extent,
                 ],
                 calibration_widths(frame.camera, cube),
-            ),
-            jnp.float32,
+            )
         ),
         colour_count=config.colour_rays,
     )

@@ -27,7 +27,7 @@ from probnerf.infer import explained, likelihood_of, without_sizes
 from probnerf.occupancy import voxel_centres
 from probnerf.populations import thin
 from probnerf.store import Prior
-from probnerf.types import BASE_Z, Observation, Posterior, joined
+from probnerf.types import BASE_Z, Observation, Posterior, joined, on_device
 
 Change = Literal["new", "view", "continued", "same", "moved"]
 
@@ -234,7 +234,8 @@ class Tracker:
         """The largest share of the telling pixels that one of a few samples explains."""
         chosen, _, _ = thin(posterior, self.track.checked)
         likelihood = without_sizes(likelihood_of(self.config.infer, observation))
-        shares = explained(self.prior.model, likelihood, observation, posterior.positions[chosen])
+        positions = on_device(np.asarray(posterior.positions)[chosen])
+        shares = explained(self.prior.model, likelihood, observation, positions)
         return float(np.max(np.asarray(shares)))
 
 

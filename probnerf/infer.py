@@ -31,7 +31,7 @@ from probnerf.prior import ProbNeRF
 from probnerf.programs import program
 from probnerf.proposal import Picture, encoder_positions, even_yaws, guesses
 from probnerf.smc import TemperedSMCConfig, tempered_smc
-from probnerf.types import BASE_Z, OBJECT, UNKNOWN, Diagnostics, Observation, Pose, Posterior
+from probnerf.types import BASE_Z, OBJECT, UNKNOWN, Diagnostics, Observation, Pose, Posterior, on_device
 
 Method = Literal["tempered_smc", "annealed_hmc"]
 _NOWHERE = 50.0  # cube units, outside every window: the kernel passes such points over
@@ -142,7 +142,7 @@ def asks_encoder(config: InferConfig, model: Model, picture: Picture | None) -> 
     # delta has too many dimensions for second derivatives
     if picture is None or not config.encoder_starts or config.sample_delta or not isinstance(model, ProbNeRF):
         return False
-    return float(jnp.mean(picture.unknown)) <= config.modes.unknown
+    return float(np.mean(np.asarray(picture.unknown))) <= config.modes.unknown
 
 
 def modes_of(
@@ -236,12 +236,11 @@ def encoder_guess(
     each = np.exp(values - top).reshape(yaws, draws).mean(axis=1) if np.isfinite(top) else np.ones(yaws)
     with np.errstate(divide="ignore"):
         log_weights = np.log(np.repeat(each / each.sum() / draws, draws))
-    nan, zero = jax.device_put(np.float32("nan")), jax.device_put(np.int32(0))
-    nans, none = jnp.full(len(values), nan), jax.device_put(np.float32(0.0))
-    ess = jax.device_put(np.float32(1.0 / np.sum(np.exp(2.0 * log_weights))))
-    diagnostics = Diagnostics(nan, zero, nan, ess, zero, zero, none, jnp.zeros(1), jnp.full(1, nan))
-    likelihoods, population = jnp.asarray(values, jnp.float32), jnp.zeros(len(values), jnp.int32)
-    weights = jnp.asarray(log_weights, jnp.float32)
+    nan, zero, none = on_device(np.nan), on_device(0, np.int32), on_device(0.0)
+    nans, ess = on_device(np.full(len(values), np.nan)), on_device(1.0 / np.sum(np.exp(2.0 * log_weights)))
+    diagnostics = Diagnostics(nan, zero, nan, ess, zero, zero, none, on_device(np.zeros(1)), on_device([np.nan]))
+    likelihoods, population = on_device(values), on_device(np.zeros(len(values)), np.int32)
+    weights = on_device(log_weights)
     return Posterior(positions, weights, likelihoods, nans, population, nan, nan, diagnostics, "underway")
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from probnerf.model import POSE_SIZE
 from probnerf.prior import ProbNeRF
 from probnerf.programs import program
-from probnerf.types import Pose
+from probnerf.types import Pose, on_device
 from probnerf.views import camera_features, encoder_image
 
 
@@ -49,8 +49,7 @@ def encoder_positions(
 
     All else of the pose is as perception guessed it.
     """
-    noise = jax.random.normal(key, (len(yaws), draws, model.latent))
-    return _encoder_positions(model, picture, jnp.asarray(yaws), noise, spread)
+    return _encoder_positions(key, model, picture, on_device(yaws), draws, spread)
 
 
 def guesses(
@@ -62,11 +61,12 @@ def guesses(
     return encoder_positions(key, model, picture, np.zeros(1, np.float32), count, 1.0)[:, : model.latent]
 
 
-@program()
+@program("draws")
 def _encoder_positions(
-    model: ProbNeRF, picture: Picture, yaws: Float[Array, "y"], noise: Float[Array, "y j k"], spread: float
+    key: PRNGKeyArray, model: ProbNeRF, picture: Picture, yaws: Float[Array, "y"], draws: int, spread: float
 ) -> Float[Array, "y_j d"]:
     zero = jnp.zeros(())
+    noise = jax.random.normal(key, (len(yaws), draws, model.latent))
 
     def at(yaw: Array, noise: Array) -> Array:
         mean, precision = potential_at(model, picture, Pose(yaw, zero, zero, zero, zero))

@@ -10,13 +10,20 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike, DTypeLike
 
 # Height of the support plane in the cube, in the view frame and in the canonical object frame alike.
 BASE_Z = -0.75
 
 # Pixel statuses of an Observation (object / free / unknown).
 UNKNOWN, OBJECT, FREE = 0, 1, 2
+
+
+def on_device(values: ArrayLike, dtype: DTypeLike = np.float32) -> Array:
+    """As `jnp.asarray`, which may compile a program for it; a new process waits for many such."""
+    return jax.device_put(np.asarray(values, dtype))
 
 
 class Rays(eqx.Module):
@@ -60,11 +67,11 @@ def joined(observations: Sequence[Observation]) -> Observation:
     """Several views of one object in one cube as one observation: their rays, and the first one's `pose_sigma`."""
 
     def rows(o: Observation, part: slice) -> dict[str, Any]:
-        return {name: jax.tree.map(lambda a: a[part], getattr(o, name)) for name in _PER_RAY}
+        return {name: jax.tree.map(lambda a: np.asarray(a)[part], getattr(o, name)) for name in _PER_RAY}
 
     parts = [rows(o, slice(None, o.colour_count)) for o in observations]
     parts += [rows(o, slice(o.colour_count, None)) for o in observations]
-    whole = jax.tree.map(lambda *a: jnp.concatenate(a), *parts)
+    whole = jax.device_put(jax.tree.map(lambda *a: np.concatenate(a), *parts))
     count = sum(o.colour_count for o in observations)
     return Observation(**whole, pose_sigma=observations[0].pose_sigma, colour_count=count)
 

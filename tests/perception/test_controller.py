@@ -23,7 +23,7 @@ CONFIG = ControllerConfig(
     hypotheses=8,
     first_hypotheses=4,
     grid=32,
-    particles=80,
+    runs=4,
 )
 
 
@@ -38,7 +38,7 @@ def answers_of(config: ControllerConfig, stages: int | None = None) -> tuple[Est
 @pytest.mark.slow
 def test_where_little_is_asked_one_run_is_all() -> None:
     found, told = answers_of(replace(CONFIG, unexplained=1.0, tolerance=inf))
-    assert len(found.log) == 1 and found.log[0].startswith("2 x 10 particles: error")
+    assert len(found.log) == 1 and found.log[0].startswith("2 x 10 particles: loses")
     assert found.hypotheses is told[-1] and found.hypotheses.result == "converged"
     assert all(h.result == "underway" for h in told[:-1]) and len(told[0].weights) == CONFIG.first_hypotheses
     assert found.posterior.positions.shape[0] == 20
@@ -49,7 +49,7 @@ def test_where_little_is_asked_one_run_is_all() -> None:
 def test_unexplained_pixels_take_all_runs_and_so_does_error(limits: dict[str, float]) -> None:
     small, _ = answers_of(replace(CONFIG, unexplained=1.0, tolerance=inf))
     found, told = answers_of(replace(CONFIG, **limits))
-    assert [line.split(": error")[0] for line in found.log] == ["2 x 10 particles", "8 x 10 particles"]
+    assert [line.split(": loses")[0] for line in found.log] == ["2 x 10 particles", "8 x 10 particles"]
     assert found.log[0].endswith("-> 8 x 10 particles") and "->" not in found.log[1]
     h = found.hypotheses
     assert h.result == "converged" and len(np.unique(h.population)) == 8
@@ -79,18 +79,18 @@ def test_a_cut_leaves_the_runs_before_it_and_repeats_bit_for_bit() -> None:
 @pytest.mark.slow
 def test_a_cut_between_later_runs_keeps_all_that_are_whole() -> None:
     config = replace(CONFIG, tolerance=0.0)
-    each = [answers_of(replace(config, particles=20 * runs))[0].hypotheses.stage for runs in (2, 3)]
+    each = [answers_of(replace(config, runs=runs))[0].hypotheses.stage for runs in (2, 3)]
     found, _ = answers_of(config, (each[0] + each[1]) // 2)
     assert found.hypotheses.result == "stages" and found.posterior.positions.shape[0] == 40
     assert len(np.unique(found.hypotheses.population)) == 4
-    assert found.log[1].startswith("4 x 10 particles: error") and found.log[2] == "no room for more (stages)"
+    assert found.log[1].startswith("4 x 10 particles: loses") and found.log[2] == "no room for more (stages)"
 
 
 @pytest.mark.parametrize(
-    ("done", "error", "missed", "needed"),
+    ("done", "loss", "missed", "needed"),
     [
         (1, 0.009, 0.0, 1),  # good enough
-        (1, 0.019, 0.0, 4),  # (1.9)^2 rounded up
+        (1, 0.029, 0.0, 3),  # 2.9 rounded up
         (4, 0.0101, 0.0, 5),
         (1, 0.5, 0.0, 6),  # all there may be
         (1, 0.009, 0.2, 6),
@@ -98,13 +98,13 @@ def test_a_cut_between_later_runs_keeps_all_that_are_whole() -> None:
         (1, float("nan"), 0.0, 6),
     ],
 )
-def test_how_many_runs_an_error_takes(done: int, error: float, missed: float, needed: int) -> None:
-    assert ControllerConfig(tolerance=0.01, unexplained=0.1).needed(done, error, missed, 6) == needed
+def test_how_many_runs_a_loss_takes(done: int, loss: float, missed: float, needed: int) -> None:
+    assert ControllerConfig(tolerance=0.01, unexplained=0.1, runs=6).needed(done, loss, missed) == needed
 
 
-def test_no_particles_are_refused() -> None:
-    with pytest.raises(ValueError, match="particles 0"):
-        ControllerConfig(particles=0)
+def test_no_runs_are_refused() -> None:
+    with pytest.raises(ValueError, match="runs 0"):
+        ControllerConfig(runs=0)
 
 
 @pytest.mark.slow

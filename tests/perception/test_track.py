@@ -17,7 +17,7 @@ from probnerf.families.tabletop import part_distances
 from probnerf.store import load_prior
 from tests.node.mugs import CAMERA, MUG
 
-QUICK = ControllerConfig(hypotheses=32, particles=1)
+QUICK = ControllerConfig(hypotheses=32, runs=1)
 
 
 def frame_from(azimuth: float, mug: Placed = MUG, stamp_ns: int = 0, seed: int = 0) -> Frame:
