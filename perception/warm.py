@@ -8,15 +8,17 @@ import numpy as np
 
 from perception.log import Log
 from perception.segment import Segment, segment
-from perception.source import SHIPPED_LOG
+from perception.source import SHIPPED_LOG, Frame
 from perception.track import Look, Tracker
 from probnerf.infer import infer
+from probnerf.programs import rehearsal
 from probnerf.types import FREE, UNKNOWN, Posterior
 
 
 def warm_up(tracker: Tracker) -> None:
     """Look at an object of the shipped recording with a tracker of the same prior and configuration: as if nothing
-    stood before it, for which inference climbs, and half hidden, as it is there, for which it begins at the prior.
+    stood before it, for which inference climbs, and half hidden, as it is there, for which it begins at the prior. It
+    is a rehearsal: programs that are kept (`probnerf.programs`) are read and not run.
 
     Raises KeyboardInterrupt where Ctrl-C ended it, which the sampler may keep for itself.
 
@@ -27,19 +29,25 @@ def warm_up(tracker: Tracker) -> None:
     hidden = segment(frame)[0]
     trial = replace(tracker, _tracks={}, _names=set())
     try:
-        update = trial.update(frame, _alone(hidden), stages=1, on_answer=lambda _: None)
-        if update.hypotheses.result == "interrupted":
-            raise KeyboardInterrupt
-        again = trial.look(frame, _alone(hidden))
-        assert again is not None
-        _sampled(trial, again, trial._tracks[again.object_id].posterior)  # what a next frame asks
-        anew = trial.look(frame, hidden, lambda _: (0, True))
-        assert anew is not None  # to publish it needs nothing new
-        _sampled(trial, anew, _sampled(trial, anew, None))
+        with rehearsal():
+            _look_twice(trial, frame, hidden)
     except ValueError:  # a prior of other objects: its own first frame compiles
         pass
     gc.collect()
     gc.freeze()
+
+
+def _look_twice(trial: Tracker, frame: Frame, hidden: Segment) -> None:
+    """At the object alone, again where that was cut short, and at it half hidden."""
+    update = trial.update(frame, _alone(hidden), stages=1, on_answer=lambda _: None)
+    if update.hypotheses.result == "interrupted":
+        raise KeyboardInterrupt
+    again = trial.look(frame, _alone(hidden))
+    assert again is not None
+    _sampled(trial, again, trial._tracks[again.object_id].posterior)  # what a next frame asks
+    anew = trial.look(frame, hidden, lambda _: (0, True))
+    assert anew is not None  # to publish it needs nothing new
+    _sampled(trial, anew, _sampled(trial, anew, None))
 
 
 def _sampled(trial: Tracker, look: Look, before: Posterior | None) -> Posterior:

@@ -54,6 +54,21 @@ def test_a_program_is_read_back_without_tracing(folder: Path) -> None:
     assert float(program(x + 1.0, times=4)["sum"]) == 20.0 and len(TRACED) == 1
 
 
+def test_a_rehearsal_reads_a_program_and_does_not_run_it(folder: Path) -> None:
+    x = np.arange(4.0, dtype=np.float32)
+    made()(x, times=4)
+    program = made()
+    with programs.rehearsal():
+        blank = program(x, times=4)
+    assert {k: (v.shape, v.dtype) for k, v in blank.items()} == {"sum": ((), x.dtype), "factor": ((3, 3), x.dtype)}
+    assert float(blank["sum"]) == 0.0 and isinstance(blank["factor"], jax.Array)
+    for kept in folder.iterdir():
+        kept.unlink()  # it is not read again
+    assert float(program(x, times=4)["sum"]) == 12.0 and len(TRACED) == 1
+    with programs.rehearsal():  # what is not kept is run
+        assert float(made()(x, how=lambda: 0)["sum"]) == 12.0
+
+
 @pytest.mark.parametrize(
     ("args", "static"),
     [
