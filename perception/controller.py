@@ -170,7 +170,8 @@ def infer_view(
             h = work.answer = work.publish(pooled(runs, work.smc.evidence_power), config.hypotheses)
             answered, missed = len(runs), 1.0 - h.diagnostics["explained"]
             loss = h.diagnostics["expected_loss"]
-            log.append(f"{work.amount(answered)}: loses {loss:.4f} nats, {100 * missed:.0f}% of pixels not explained")
+            told = f"expected loss {loss:.4f} nats, {100 * missed:.0f}% of pixels not explained"
+            log.append(f"{work.amount(answered)}: {told}")
             if grows and short is None:
                 needed = config.needed(answered, loss, missed)
             if short is None and needed > answered:

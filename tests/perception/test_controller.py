@@ -38,7 +38,7 @@ def answers_of(config: ControllerConfig, stages: int | None = None) -> tuple[Est
 @pytest.mark.slow
 def test_where_little_is_asked_one_run_is_all() -> None:
     found, told = answers_of(replace(CONFIG, unexplained=1.0, tolerance=inf))
-    assert len(found.log) == 1 and found.log[0].startswith("2 x 10 particles: loses")
+    assert len(found.log) == 1 and found.log[0].startswith("2 x 10 particles: expected loss")
     assert found.hypotheses is told[-1] and found.hypotheses.result == "converged"
     assert all(h.result == "underway" for h in told[:-1]) and len(told[0].weights) == CONFIG.first_hypotheses
     assert found.posterior.positions.shape[0] == 20
@@ -49,7 +49,7 @@ def test_where_little_is_asked_one_run_is_all() -> None:
 def test_unexplained_pixels_take_all_runs_and_so_does_error(limits: dict[str, float]) -> None:
     small, _ = answers_of(replace(CONFIG, unexplained=1.0, tolerance=inf))
     found, told = answers_of(replace(CONFIG, **limits))
-    assert [line.split(": loses")[0] for line in found.log] == ["2 x 10 particles", "8 x 10 particles"]
+    assert [line.split(": expected loss")[0] for line in found.log] == ["2 x 10 particles", "8 x 10 particles"]
     assert found.log[0].endswith("-> 8 x 10 particles") and "->" not in found.log[1]
     h = found.hypotheses
     assert h.result == "converged" and len(np.unique(h.population)) == 8
@@ -83,7 +83,7 @@ def test_a_cut_between_later_runs_keeps_all_that_are_whole() -> None:
     found, _ = answers_of(config, (each[0] + each[1]) // 2)
     assert found.hypotheses.result == "stages" and found.posterior.positions.shape[0] == 40
     assert len(np.unique(found.hypotheses.population)) == 4
-    assert found.log[1].startswith("4 x 10 particles: loses") and found.log[2] == "no room for more (stages)"
+    assert found.log[1].startswith("4 x 10 particles: expected loss") and found.log[2] == "no room for more (stages)"
 
 
 @pytest.mark.parametrize(
