@@ -122,9 +122,10 @@ def expected_loss(h: Hypotheses, region: Bool[np.ndarray, "G G G"]) -> float:
 
     With independent estimates p_m of a voxel's probability, m = 1 .. M, of mean p and variance s^2, their mean's log
     score lies s^2 / M / (2 p (1 - p)) below that of p, to second order, if p is right: so much more of them would
-    gain, and it falls with 1 / M. NaN where there are no two populations.
+    gain, and it falls with 1 / M. All populations that have weight count alike. Each is known by the shapes of it that
+    are published; the fewer, the more is lost. NaN where there are no two populations.
     """
-    names = np.unique(h.population)
+    names = np.unique(h.population[h.weights > 0.0])
     if len(names) < 2:
         return float("nan")
     total, squares = np.zeros(h.seen.shape, np.float32), np.zeros(h.seen.shape, np.float32)

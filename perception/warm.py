@@ -18,7 +18,7 @@ from probnerf.types import FREE, UNKNOWN, Posterior
 def warm_up(tracker: Tracker) -> None:
     """Look at an object of the shipped recording with a tracker of the same prior and configuration: as if nothing
     stood before it, for which inference climbs, and half hidden, as it is there, for which it begins at the prior. It
-    is a rehearsal: programs that are kept (`probnerf.programs`) are read and not run.
+    is a rehearsal: programs that are kept (`probnerf.programs`) are read, or compiled, and not run.
 
     Raises KeyboardInterrupt where Ctrl-C ended it, which the sampler may keep for itself.
 
@@ -28,18 +28,20 @@ def warm_up(tracker: Tracker) -> None:
     frame = next(iter(Log(SHIPPED_LOG)))
     hidden = segment(frame)[0]
     trial = replace(tracker, _tracks={}, _names=set())
-    try:
-        with rehearsal():
-            _look_twice(trial, frame, hidden)
-    except ValueError:  # a prior of other objects: its own first frame compiles
-        pass
+    with rehearsal():
+        try:
+            look = trial.look(frame, _alone(hidden))
+        except ValueError:  # a prior of other objects: its own first frame compiles
+            look = None
+        if look is not None:
+            _infer_twice(trial, look, frame, hidden)
     gc.collect()
     gc.freeze()
 
 
-def _look_twice(trial: Tracker, frame: Frame, hidden: Segment) -> None:
-    """At the object alone, again where that was cut short, and at it half hidden."""
-    update = trial.update(frame, _alone(hidden), stages=1, on_answer=lambda _: None)
+def _infer_twice(trial: Tracker, look: Look, frame: Frame, hidden: Segment) -> None:
+    """The object alone, again where that was cut short, and half hidden."""
+    update = trial.infer(look, stages=1, on_answer=lambda _: None)
     if update.hypotheses.result == "interrupted":
         raise KeyboardInterrupt
     again = trial.look(frame, _alone(hidden))

@@ -169,7 +169,9 @@ def sampler_of(
     if before is None:
         return config.smc_from_prior if reference is None else config.smc
     made = len(before.diagnostics.beta)
-    return config.smc if made % config.smc.populations == 0 else config.smc_from_prior
+    both = [smc for smc in (config.smc, config.smc_from_prior) if made % smc.populations == 0]
+    each = len(before.positions) / made  # several runs of the one may be as many populations as one of the other
+    return min(both, key=lambda smc: abs(each - smc.moves * smc.particles), default=config.smc_from_prior)
 
 
 def infer(

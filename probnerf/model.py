@@ -111,7 +111,7 @@ def split_position(
     return weights, pose
 
 
-@program()
+@program(rehearse=False)
 def faces_of_view(observation: Observation, likelihood: Likelihood) -> Float[Array, "n m"]:
     """Crossings of every ray that its pixel can tell of: constants of the observation, computed once per view.
 

@@ -150,17 +150,18 @@ def log_prior(q: Float[Array, "... d"]) -> Float[Array, "..."]:
 
 
 def thin(posterior: Posterior, count: int) -> tuple[Int[np.ndarray, "s"], Float[np.ndarray, "s"], Int[np.ndarray, "s"]]:
-    """(indices, weights f64, population) of about `count` representative samples.
+    """(indices, weights f64, population) of `count` representative samples, or one a population where those are more.
 
-    Each population keeps an equal number of them, taken systematically by weight, and its own share of the weight: a
-    planner sees every population, and their disagreement is the Monte Carlo error.
+    Each population keeps an equal number of them, or the first ones one more, taken systematically by weight, and its
+    own share of the weight: a planner sees every population, and their disagreement is the Monte Carlo error.
     """
     log_w = np.asarray(posterior.log_weights, np.float64)
     population = np.asarray(posterior.population)
     names = np.unique(population)
-    each = max(1, count // len(names))
+    count = max(count, len(names))
+    kept = count // len(names) + (np.arange(len(names)) < count % len(names))
     indices, weights = [], []
-    for name in names:
+    for name, each in zip(names, kept, strict=True):
         members = np.flatnonzero(population == name)
         w = np.exp(log_w[members] - log_w[members].max())
         share = np.exp(log_w[members]).sum()
@@ -169,4 +170,4 @@ def thin(posterior: Posterior, count: int) -> tuple[Int[np.ndarray, "s"], Float[
         weights.append(np.full(each, share / each))
     w = np.concatenate(weights)
     w = w / w.sum() if w.sum() > 0 else np.full(len(w), 1.0 / len(w))
-    return np.concatenate(indices), w, np.repeat(names, each)
+    return np.concatenate(indices), w, np.repeat(names, kept)

@@ -71,11 +71,14 @@ def _folder() -> Path | None:
 class Program:
     """A function as `jax.jit` compiles it, but for where its compiled code comes from."""
 
-    def __init__(self, function: Callable[..., Any], static_argnames: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, function: Callable[..., Any], static_argnames: tuple[str, ...] = (), rehearse: bool = True
+    ) -> None:
         update_wrapper(self, function)
         self._name = (function.__module__, function.__qualname__)
         self.jitted = jax.jit(function, static_argnames=static_argnames)
         self._static = static_argnames
+        self._rehearse = rehearse
         self._signature = inspect.signature(function)
         self._ready: dict[Any, Callable[..., Any]] = {}
 
@@ -94,8 +97,8 @@ class Program:
                 if key not in self._ready:
                     self._ready[key] = self._found(given, static, key)
         run = self._ready[key]
-        if _REHEARSING.get() and isinstance(run, jax.stages.Compiled):
-            return jax.tree.map(lambda a: jax.device_put(np.zeros(a.shape, a.dtype)), run.out_info)
+        if self._rehearse and _REHEARSING.get() and isinstance(run, jax.stages.Compiled):
+            return jax.tree.map(lambda a: jax.device_put(np.zeros(a.shape, a.dtype), a.sharding), run.out_info)
         return run(**given)
 
     def _found(self, given: dict[str, Any], static: dict[str, Any], key: tuple) -> Callable[..., Any]:
@@ -114,11 +117,14 @@ class Program:
         return compiled
 
 
-def program(*static_argnames: str) -> Callable[[F], F]:
-    """Decorator: compiled once for each set of shapes and of static arguments, which have these names."""
+def program(*static_argnames: str, rehearse: bool = True) -> Callable[[F], F]:
+    """Decorator: compiled once for each set of shapes and of static arguments, which have these names.
+
+    Without `rehearse` it is run in a rehearsal, too: what others are compiled for hangs on its values.
+    """
 
     def decorate(function: F) -> F:
-        return cast(F, Program(function, static_argnames))
+        return cast(F, Program(function, static_argnames, rehearse))
 
     return decorate
 

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from probnerf.populations import log_prior, pooled, shares, start_from
+from probnerf.infer import InferConfig, quick_smc, sampler_of
+from probnerf.populations import log_prior, pooled, shares, start_from, thin
 from probnerf.smc import TemperedSMCConfig, tempered_smc
 from probnerf.types import Posterior
 
@@ -71,3 +72,24 @@ def test_pooled_samples_start_fewer_populations_at_their_own_densities() -> None
     with pytest.raises(ValueError, match="do not divide"):
         start_from(whole, 3)
     assert jnp.isfinite(log_q).all()
+
+
+@pytest.mark.parametrize(("count", "kept"), [(8, [2, 2, 2, 2]), (10, [3, 3, 2, 2]), (4, [1] * 4), (2, [1] * 4)])
+def test_so_many_samples_stand_for_all_and_every_population_keeps_its_weight(count: int, kept: list[int]) -> None:
+    whole = pooled([_run(0), _run(1)], 1.0)
+    indices, weights, population = thin(whole, count)
+    assert np.bincount(population).tolist() == kept and len(indices) == max(count, 4)
+    np.testing.assert_array_equal(np.asarray(whole.population)[indices], population)
+    share = np.bincount(np.asarray(whole.population), weights=np.exp(np.asarray(whole.log_weights, np.float64)))
+    np.testing.assert_allclose(np.bincount(population, weights=weights), share / share.sum(), rtol=1e-6)
+
+
+def test_what_goes_on_keeps_to_the_populations_that_made_it() -> None:
+    """Two runs of two populations are as many as one of four."""
+    config = InferConfig(smc=quick_smc(4, 4), smc_from_prior=quick_smc(2, 16))
+
+    def made_by(smc: TemperedSMCConfig, runs: int) -> Posterior:
+        return pooled([tempered_smc(jax.random.key(k), _log_likelihood, None, 3, smc) for k in range(runs)], 0.0)
+
+    for smc, runs in ((config.smc, 1), (config.smc, 2), (config.smc_from_prior, 1), (config.smc_from_prior, 2)):
+        assert sampler_of(config, None, made_by(smc, runs)) is smc
