@@ -1,8 +1,9 @@
 """How long a start takes: from a new process to a node that may open its camera, with an empty compilation cache and
 with a filled one.
 
-What `farside live` does before its first frame, in a process of its own: imports, the prior, and every level of the
-controller once on the shipped recording.
+What `farside live` does before its first frame, in a process of its own: imports, the prior, and a rehearsal of what
+inference runs, whose programs are read, or compiled, and not run. What their first run costs besides falls to the first
+object: its first three stages (and their answers) are timed beside those of the same object once more.
 """
 
 import json
@@ -19,11 +20,15 @@ from benchmarks.rows import Row
 from benchmarks.summary import mean_rows, say, table
 
 PARTS = ("imports", "prior", "programs", "whole")
+OBJECTS = ("first_object", "again")
 EMPTY, FILLED = "empty cache", "filled cache"
 
 
 def _start(begun: float) -> dict[str, float]:
     """Seconds of each part, in this new process, which the parent began at `begun` (time.time)."""
+    from perception.log import Log
+    from perception.segment import segment
+    from perception.source import SHIPPED_LOG
     from perception.track import Tracker
     from perception.warm import warm_up
     from probnerf.store import load_prior
@@ -33,7 +38,13 @@ def _start(begun: float) -> dict[str, float]:
     loaded = time.time()
     warm_up(Tracker(prior))
     ready = time.time()
-    return dict(zip(PARTS, (imported - begun, loaded - imported, ready - loaded, ready - begun), strict=True))
+    frame = next(iter(Log(SHIPPED_LOG)))
+    found, ends = segment(frame)[0], [time.time()]
+    for _ in OBJECTS:
+        Tracker(prior).update(frame, found, stages=3, on_answer=lambda _: None)
+        ends.append(time.time())
+    parts = (imported - begun, loaded - imported, ready - loaded, ready - begun, *np.diff(ends))
+    return dict(zip((*PARTS, *OBJECTS), map(float, parts), strict=True))
 
 
 def _started(cache: str) -> dict[str, float]:
@@ -58,10 +69,11 @@ def main(out: Path, quick: bool = False, n: int = 5) -> list[Row]:
         found[FILLED] = [_started(cache) for _ in range(1 if quick else n)]
     rows, lines = [], []
     for condition, starts in found.items():
-        for part in PARTS:
+        for part in (*PARTS, *OBJECTS):
             rows += mean_rows("startup", "node", condition, part, [s[part] for s in starts], "s")
-        lines.append([condition, str(len(starts)), *(f"{np.median([s[part] for s in starts]):.1f}" for part in PARTS)])
-    table("Seconds of a start, medians", ("condition", "starts", *PARTS), lines)
+        medians = (f"{np.median([s[part] for s in starts]):.1f}" for part in (*PARTS, *OBJECTS))
+        lines.append([condition, str(len(starts)), *medians])
+    table("Seconds of a start, medians", ("condition", "starts", *PARTS, *OBJECTS), lines)
     return rows
 
 

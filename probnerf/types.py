@@ -22,7 +22,7 @@ UNKNOWN, OBJECT, FREE = 0, 1, 2
 
 
 def on_device(values: ArrayLike, dtype: DTypeLike = np.float32) -> Array:
-    """As `jnp.asarray`, which may compile a program for it; a new process waits for many such."""
+    """NumPy's array of these, on the device. `jnp.asarray` may compile a program for it, and a new process many."""
     return jax.device_put(np.asarray(values, dtype))
 
 
