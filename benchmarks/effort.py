@@ -92,7 +92,7 @@ def main(out: Path, quick: bool = False, prior: Path | None = None, n: int = 8, 
     amounts = {CONTROLLER: config, LARGEST: replace(config, tolerance=0.0)}
     rate = base_rate(128 if quick else 1024, config=config.observe)
     spent: dict[str, list[Spent]] = {condition: [] for condition in CONDITIONS}
-    warm = False
+    warm = set[str]()
 
     def measured(view: VesselView, amount: ControllerConfig) -> tuple[dict[str, float], Estimate]:
         """One scene's figures with one amount of model, by metric, and what they are of."""
@@ -114,9 +114,9 @@ def main(out: Path, quick: bool = False, prior: Path | None = None, n: int = 8, 
 
     for condition in CONDITIONS:
         for view in scenes(condition, n):
-            if not warm:  # once
+            if condition not in warm:  # each begins elsewhere, with programs of its own
                 measured(view, replace(config, runs=1))
-                warm = True
+                warm.add(condition)
             got = {method: measured(view, amount) for method, amount in amounts.items()}
             values = {method: values for method, (values, _) in got.items()}
             spent[condition].append(Spent(values, got[CONTROLLER][1].log))
