@@ -302,13 +302,17 @@ def test_a_wrong_focal_length_errs_as_the_widths_say() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_a_worse_calibration_gives_a_less_certain_posterior() -> None:
-    """On the mean of four answers of four whole runs each."""
+    """Eight answers of four whole runs each: one answer's spread of the size moves by a factor of two with chance."""
     frame, found, _, _, _ = seen(CAN)
     prior, config = load_prior(None), ControllerConfig(tolerance=0.0)
-    doubt = []
+    spread, doubt = [], []
     for share in (0.0, 0.1):
         told = uncertain(frame, share)
-        answers = [estimate(told, found, prior, config, seed=seed).hypotheses for seed in range(4)]
+        answers = [estimate(told, found, prior, config, seed=seed).hypotheses for seed in range(8)]
+        log_scale = np.concatenate([h.pose[:, 3] for h in answers])
+        weights = np.concatenate([h.weights for h in answers]) / len(answers)
+        spread.append(np.sqrt(weights @ (log_scale - weights @ log_scale) ** 2))
         p = [np.tensordot(h.weights, h.solid, axes=1) for h in answers]
         doubt.append(np.mean([(one * (1.0 - one)).mean() for one in p]))
+    assert spread[1] > 1.15 * spread[0]  # of the size
     assert doubt[1] > 1.3 * doubt[0]  # of what is occupied
