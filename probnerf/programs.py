@@ -143,7 +143,8 @@ def _compiled(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
 def _write(path: Path, compiled: jax.stages.Compiled) -> None:
     try:
         code, _, out_tree = serialize_executable.serialize(compiled)
-    except (ValueError, NotImplementedError):  # it closes over arrays: compiled anew in each process
+    except (ValueError, NotImplementedError, jax.errors.JaxRuntimeError):
+        # it closes over arrays, or XLA does not write it a second time: compiled anew in each process
         return
     devices = {d.id for s in jax.tree.leaves(compiled.input_shardings) for d in s.device_set}
     # the tree as an object: equinox's marks of absent fields do not survive in a pickled treedef

@@ -13,9 +13,14 @@ import pytest
 from benchmarks.occluded import carton_seeds, half_hidden
 from benchmarks.scene import vessel_view
 from benchmarks.unseen import any_view
+from perception.controller import ControllerConfig
+from perception.log import Log
+from perception.segment import segment
+from perception.source import SHIPPED_LOG
 from perception.track import Tracker, Update
-from perception.warm import warm_up
-from probnerf import infer, model, modes, programs, proposal, smc
+from perception.warm import _alone, warm_up
+from probnerf import fused, infer, model, modes, programs, proposal, smc
+from probnerf.infer import InferConfig, quick_smc
 from probnerf.prior import PRESETS, ProbNeRF
 from probnerf.store import Prior, load_prior
 from probnerf.types import UNKNOWN
@@ -84,6 +89,12 @@ def test_a_prior_of_other_objects_is_no_error(monkeypatch: pytest.MonkeyPatch) -
     assert len(asked) == 1
 
 
+def _programs() -> list[Any]:
+    """Of inference, all of them."""
+    modules = (smc, infer, modes, proposal, model)
+    return [f for module in modules for f in vars(module).values() if isinstance(f, programs.Program)]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kept", [False, True])
 def test_nothing_large_is_left_for_the_first_frame_to_compile(
@@ -92,8 +103,7 @@ def test_nothing_large_is_left_for_the_first_frame_to_compile(
     """Of an object seen well and of one half hidden, neither of which is in the recording; also after a rehearsal that
     read what another had kept, which changes no answer.
     """
-    prior, modules = load_prior(), (smc, infer, modes, proposal, model)
-    every: list[Any] = [f for module in modules for f in vars(module).values() if isinstance(f, programs.Program)]
+    prior, every = load_prior(), _programs()
     assert len(every) > 8
 
     def warmed() -> list[int]:
@@ -126,3 +136,39 @@ def test_nothing_large_is_left_for_the_first_frame_to_compile(
     assert ready() == before
     for one, other in zip(expected, found, strict=False):
         np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.slow
+def test_without_the_kernel_a_rehearsal_finds_the_sizes_of_its_view(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Programs have each view's own sizes there, which are found by running what decides them, as without a rehearsal:
+    the same object's answer is the same, and compiles nothing.
+    """
+    monkeypatch.setattr(fused, "available", lambda: False)
+    small = quick_smc(2, 4)
+    inference = replace(InferConfig(), lattice=8, smc=small, smc_from_prior=small)
+    config = ControllerConfig(infer=replace(inference, modes=replace(inference.modes, starts=4)))
+    prior = Prior(ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {}, "x")
+    frame = next(iter(Log(SHIPPED_LOG)))
+    alone = _alone(segment(frame)[0])
+
+    def answer() -> np.ndarray:
+        given = dict(stages=3, on_answer=lambda _: None)
+        return Tracker(prior, config).update(frame, alone, **given).hypotheses.opacity
+
+    expected = answer()
+    assert np.ptp(expected) > 0
+    monkeypatch.setattr(programs, "_folder", lambda: tmp_path)
+    for _ in range(2):  # compiled and kept; read
+        for f in _programs():
+            monkeypatch.setattr(f, "_ready", {})
+        try:
+            warm_up(Tracker(prior, config))
+        finally:
+            gc.unfreeze()
+    kept = set(tmp_path.iterdir())
+    assert len(kept) > 8
+    found = answer()
+    assert set(tmp_path.iterdir()) == kept
+    assert np.mean(found != expected) < 0.01  # of 255 steps: kept programs are compiled with another option, and round

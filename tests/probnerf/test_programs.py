@@ -98,6 +98,18 @@ def test_a_file_that_cannot_be_read_is_made_again(folder: Path) -> None:
     assert len(TRACED) == 4
 
 
+@pytest.mark.parametrize("error", [ValueError, NotImplementedError, jax.errors.JaxRuntimeError])
+def test_what_cannot_be_written_is_run_all_the_same(
+    error: type[Exception], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: Any) -> None:
+        raise error("UNIMPLEMENTED: `LessThan` is not serializable.")
+
+    monkeypatch.setattr(programs.serialize_executable, "serialize", refuse)
+    assert float(made()(np.ones(4, np.float32))["sum"]) == 8.0
+    assert not list(folder.iterdir())
+
+
 def test_what_its_name_does_not_tell_is_left_to_jit(folder: Path) -> None:
     """Two local functions of one name are two programs."""
     for value in (1, 2):
