@@ -69,7 +69,7 @@ def main(
 
     Args:
         prior: weights to use; the shipped ones by default
-        n: vessels
+        n: vessels, the first so many
         methods: only these: names, groups or patterns with *, separated by semicolons
         conditions: only these: patterns such as hidden*;*RGB-D
         seed: of the samplers
@@ -90,7 +90,9 @@ def main(
             _measure(loaded, chosen, asked, n, seed, results)
         except KeyboardInterrupt:
             say(f"stopped; {results} keeps what is done")
-    lines = [line for line in newest(read_lines(results), loaded.hash, seed) if line["condition"] in asked]
+    lines = newest(read_lines(results), loaded.hash, seed)
+    vessels = sorted({line["object"] for line in lines})[:n]
+    lines = [line for line in lines if line["condition"] in asked and line["object"] in vessels]
     lines = [line for line in lines if line["method"] in {m.name for m in chosen}]
     if not lines:
         raise ValueError(f"{results} has no results of this prior, these methods and conditions; leave --only-chart")
