@@ -230,6 +230,8 @@ def paper_schedule(hmc: AnnealedHMCConfig, conditions: tuple[str, ...] = CONDITI
     return _hmc("paper", "paper", hmc, conditions)
 
 
+CONTROLLER = _estimate("controller", "controller", "to the end", runs=None)
+FROM_PRIOR = _estimate("from the prior", "controller", "from the prior", runs=None, infer={"encoder_starts": False})
 VI, PAPER = _vi(VIConfig()), paper_schedule(annealed(100, 100), TELLING)
 FULL = PAPER.name  # the paper's own schedule; it takes long
 METHODS = (
