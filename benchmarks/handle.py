@@ -165,17 +165,17 @@ def _rows(lines: Sequence[Line], prior_says: float) -> list[Row]:
             values |= {metric: (np.array([x[metric] for x in own]), unit) for metric, unit in MEASURED.items()}
         for metric, (each, unit) in values.items():
             rows.extend(mean_rows("handle", name, BEHIND, metric, each, unit))
-        gaps = []
-        for metric in ("log_score", "hidden_nll") if name != PRIOR else ("log_score",):
-            both = [i for i, x in enumerate(own) if x["object"] in reference]
-            if name == OWN or not both:
+        gaps = ["", ""]
+        both = [i for i, x in enumerate(own) if x["object"] in reference]
+        for column, metric in enumerate(("log_score", "hidden_nll")):
+            if name == OWN or metric not in values or not both:
                 continue
             others = [reference[own[i]["object"]] for i in both]
             theirs = [_scored(x) if metric == "log_score" else x["hidden_nll"] for x in others]
             gap = paired_interval(values[metric][0][both], np.array(theirs))
             for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
                 rows.append(Row("handle", name, BEHIND, f"{metric}_above_controller{label}", value, "nats", gap.n))
-            gaps.append(f"{gap.mean:+.3f} ({gap.low:+.3f}..{gap.high:+.3f})")
+            gaps[column] = f"{gap.mean:+.3f} ({gap.low:+.3f}..{gap.high:+.3f})"
         shown = [interval(each) for each, _ in values.values()]
         ends = [f"{i.mean:.3f} ({i.low:.2f}..{i.high:.2f})" for i in shown[:4]]
         cells.append([name, str(len(own)), *ends, f"{shown[4].mean:.3f}" if len(shown) > 4 else "", *gaps])

@@ -112,8 +112,12 @@ def main(
         raise ValueError(f"no axis begins with {axes!r}; there are: {'; '.join(a.name for a in AXES)}")
     loaded, rate = load_prior(prior), base_rate(128 if quick else 1024)
     settings = {"digest": digest(asdict(ControllerConfig()), quick)}
+    lines = read_lines(results)
+    kept = [line["settings"] for line in lines if line["prior"] == loaded.hash]
+    if only_chart and kept:  # the newest ones, which may be of other settings than today's
+        settings = kept[-1]
     same = {"prior": loaded.hash, "method": "tempered_smc", "settings": settings}
-    done = {key(line): line for line in read_lines(results)}
+    done = {key(line): line for line in lines}
 
     def answered(picture: VesselPicture, axis: Axis, amount: float, seed: int) -> Seen | None:
         """From the file, or made and kept there; None where it may only be read."""
@@ -126,8 +130,8 @@ def main(
             line |= {"seen": asdict(look(picture, axis, amount, loaded, rate, seed))}
             append_line(results, line)
             done[key(line)] = line
-        kept = done[key(line)]["seen"]
-        return Seen(**{**kept, "p_free": tuple(kept["p_free"]), "occupied": tuple(kept["occupied"])})
+        seen = done[key(line)]["seen"]
+        return Seen(**{**seen, "p_free": tuple(seen["p_free"]), "occupied": tuple(seen["occupied"])})
 
     views = pictures(n)
     asked = [(seed, p) for seed in range(seeds) for p in views]

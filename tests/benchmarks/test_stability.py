@@ -67,6 +67,8 @@ def test_answers_that_are_there_are_not_made_again(tmp_path: Path, monkeypatch: 
     assert len(asked) == 1 + 4 + 3  # as it ships once
     again = main(tmp_path, **settings, only_chart=True)
     assert again == first and len(asked) == 8
+    monkeypatch.setattr("benchmarks.stability.ControllerConfig", lambda: ControllerConfig(runs=3))
+    assert main(tmp_path, **settings, only_chart=True) == first  # what the file holds, whatever ships by now
     value = {(r.method, r.condition, r.metric): r.value for r in first}
     assert value["occluded, share", "0.6", "hidden_nll_above_shipped"] == pytest.approx(0.6)
     assert value["occluded, share", "0.6", "flagged"] == 1.0 and value["occluded, share", "0.3", "flagged"] == 0.0
