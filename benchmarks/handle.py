@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from matplotlib.figure import Figure
 
-from benchmarks.methods import CONTROLLER, FROM_PRIOR, METHODS, PAPER, Question, answer, settings_of
+from benchmarks.methods import CONTROLLER, FROM_PRIOR, METHODS, Question, answer, settings_of
 from benchmarks.results import Line, append_line, digest, key, newest, read_lines
 from benchmarks.rows import Row
 from benchmarks.scene import GRID, base_rate
@@ -40,8 +40,8 @@ from probnerf.store import load_prior
 RESULTS = Path(__file__).with_suffix(".jsonl")
 OWN = CONTROLLER.name
 PRIOR = "the prior alone"
-ASKED = (CONTROLLER, FROM_PRIOR, next(m for m in METHODS if m.name == "encoder alone"), PAPER)
-COLOURS = dict(zip((m.name for m in ASKED), ("tab:blue", "tab:purple", "tab:orange", "tab:green"), strict=True))
+ASKED = (CONTROLLER, FROM_PRIOR, next(m for m in METHODS if m.name == "encoder alone"))
+COLOURS = dict(zip((m.name for m in ASKED), ("tab:blue", "tab:purple", "tab:orange"), strict=True))
 REACH = 2.25  # voxels: the family's shapes reach at most 0 without a handle and at least 4 with one
 EDGES = (0.0, 0.1, 0.3, 0.6, 1.0)  # of p, in the picture
 
@@ -99,7 +99,7 @@ def main(
     Args:
         prior: weights to use; the shipped ones by default
         n: objects
-        slow: of them, those that the controller from the prior and the paper's annealed HMC answer, too
+        slow: of them, those that the controller from the prior answers, too
         methods: only these, separated by semicolons
         seed: of the samplers
         results: file that results are appended to, and read from
@@ -117,7 +117,7 @@ def main(
         for method in (m for m in ASKED if m.name in names):
             told = {"digest": digest([settings_of(method, config), asdict(config)], quick)}
             own = {"prior": loaded.hash, "method": method.name, "settings": told, "condition": BEHIND, "seed": seed}
-            count = min(n, slow) if method in (FROM_PRIOR, PAPER) else n
+            count = min(n, slow) if method is FROM_PRIOR else n
             for number, view in views(BEHIND, count, lambda number: key({**own, "object": number}) in done):  # noqa: B023
                 if view is None:
                     continue
