@@ -5,15 +5,16 @@ Cups, mugs and pitchers of which no pixel shows a handle, not picked by whether 
 handle at +x, and has one if it reaches farther past its body there than any of the family does without (`reach`). p is
 the share of the answer's weight on shapes that do.
 
-Measures: said and true, the mean p and the share of objects with a handle; log_score and brier of p; hidden_nll as
-`farside bench hidden`. "the prior alone" says of each object how many of the prior's shapes have a handle. "from the
-prior" is the controller that does not begin at modes. Results are appended to a file, object by object, and what is
-there is not made again.
+Measures: said and true, the mean p and the share of objects with a handle, of all and by p; log_score and brier of p;
+hidden_nll as `farside bench hidden`. "the prior alone" says of each object how many of the prior's shapes have a
+handle. "from the prior" is the controller that does not begin at modes. Results are appended to a file, object by
+object, and what is there is not made again.
 """
 
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import jax
@@ -43,7 +44,7 @@ PRIOR = "the prior alone"
 ASKED = (CONTROLLER, FROM_PRIOR, next(m for m in METHODS if m.name == "encoder alone"))
 COLOURS = dict(zip((m.name for m in ASKED), ("tab:blue", "tab:purple", "tab:orange"), strict=True))
 REACH = 2.25  # voxels: the family's shapes reach at most 0 without a handle and at least 4 with one
-EDGES = (0.0, 0.1, 0.3, 0.6, 1.0)  # of p, in the picture
+EDGES = (0.0, 0.05, 0.3, 0.6, 1.0)  # of p
 
 
 def reach(shapes: Bool[np.ndarray, "s x y z"]) -> Float[np.ndarray, "s"]:
@@ -88,7 +89,7 @@ def main(
     quick: bool = False,
     prior: Path | None = None,
     n: int = 86,
-    slow: int = 24,
+    slow: int = 40,
     methods: str = "",
     seed: int = 0,
     results: Path = RESULTS,
@@ -165,6 +166,10 @@ def _rows(lines: Sequence[Line], prior_says: float) -> list[Row]:
             values |= {metric: (np.array([x[metric] for x in own]), unit) for metric, unit in MEASURED.items()}
         for metric, (each, unit) in values.items():
             rows.extend(mean_rows("handle", name, BEHIND, metric, each, unit))
+        for low, high, inside in _bins(p):
+            told = f"where p is {low:g} to {high:g}"
+            rows.append(Row("handle", name, BEHIND, f"said {told}", float(p[inside].mean()), "", int(inside.sum())))
+            rows.append(Row("handle", name, BEHIND, f"true {told}", float(true[inside].mean()), "", int(inside.sum())))
         gaps = ["", ""]
         both = [i for i, x in enumerate(own) if x["object"] in reference]
         for column, metric in enumerate(("log_score", "hidden_nll")):
@@ -198,6 +203,12 @@ def _scored(line: Line) -> float:
     return float(log_score(np.array([line["p"]]), np.array([line["handle"]]), line["shapes"])[0])
 
 
+def _bins(p: Float[np.ndarray, "n"]) -> list[tuple[float, float, Bool[np.ndarray, "n"]]]:
+    """Those of `EDGES` that have any p: low, high, which."""
+    which = np.clip(np.searchsorted(EDGES, p, side="right") - 1, 0, len(EDGES) - 2)
+    return [(low, high, which == b) for b, (low, high) in enumerate(pairwise(EDGES)) if (which == b).any()]
+
+
 def _draw(lines: Sequence[Line], path: Path) -> None:
     """What each method said of objects with a handle and without; said against true, in bins of what was said."""
     figure = Figure(figsize=(11, 4.4), layout="constrained")
@@ -211,11 +222,10 @@ def _draw(lines: Sequence[Line], path: Path) -> None:
             at = k + (0.16 if side else -0.16) + rng.uniform(-0.1, 0.1, np.sum(true == side))
             face = COLOURS[name] if side else "none"
             each.plot(at, p[true == side], mark, color=COLOURS[name], mfc=face, ms=5, label=label if k == 0 else None)
-        which = np.clip(np.searchsorted(EDGES, p, side="right") - 1, 0, len(EDGES) - 2)
-        filled = [b for b in range(len(EDGES) - 1) if (which == b).sum() > 2]
-        share = np.array([true[which == b].mean() for b in filled])
-        error = 1.96 * np.sqrt(share * (1 - share) / np.array([(which == b).sum() for b in filled]))
-        said = [p[which == b].mean() for b in filled]
+        filled = [inside for _, _, inside in _bins(p) if inside.sum() > 2]
+        share = np.array([true[inside].mean() for inside in filled])
+        error = 1.96 * np.sqrt(share * (1 - share) / np.array([inside.sum() for inside in filled]))
+        said = [p[inside].mean() for inside in filled]
         bins.errorbar(said, share, error, fmt="o-", color=COLOURS[name], capsize=3, ms=5, label=name)
     each.set_xticks(range(len(names)), [f"{n}\n({sum(x['method'] == n for x in lines)})" for n in names], fontsize=9)
     each.set(ylabel="P(a handle is behind)", ylim=(-0.03, 1.03), title="what was said of each object")
