@@ -13,14 +13,13 @@ object, and what is there is not made again.
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from matplotlib.figure import Figure
 
 from benchmarks.methods import CONTROLLER, FROM_PRIOR, METHODS, Question, answer, settings_of
@@ -45,6 +44,10 @@ ASKED = (CONTROLLER, FROM_PRIOR, next(m for m in METHODS if m.name == "encoder a
 COLOURS = dict(zip((m.name for m in ASKED), ("tab:blue", "tab:purple", "tab:orange"), strict=True))
 REACH = 2.25  # voxels: the family's shapes reach at most 0 without a handle and at least 4 with one
 EDGES = (0.0, 0.05, 0.3, 0.6, 1.0)  # of p
+PRIOR_SHAPES = 1000
+UNITS = {"said": "", "true": "", "log_score": "nats", "brier": "", "hidden_nll": "nats", "point_gradients": ""}
+COMPARED = ("log_score", "hidden_nll")  # with the controller's
+COLUMNS = ("said", "true", "log_score", "brier", "hidden_nll", *(f"{metric} above" for metric in COMPARED))
 
 
 def reach(shapes: Bool[np.ndarray, "s x y z"]) -> Float[np.ndarray, "s"]:
@@ -78,7 +81,9 @@ def has_handle(model: Model, positions: Float[Array, "s d"]) -> Bool[np.ndarray,
     return reach(solid(np.asarray(grids))) > REACH
 
 
-def log_score(p: Float[np.ndarray, "n"], true: Bool[np.ndarray, "n"], shapes: int) -> Float[np.ndarray, "n"]:
+def log_score(
+    p: Float[np.ndarray, "n"], true: Bool[np.ndarray, "n"], shapes: int | Int[np.ndarray, "n"]
+) -> Float[np.ndarray, "n"]:
     """-log of what was said of what is true, nats; p as if half a shape more had spoken for either side."""
     p = (p * shapes + 0.5) / (shapes + 1)
     return -np.log(np.where(true, p, 1.0 - p))
@@ -114,12 +119,16 @@ def main(
     loaded, config = load_prior(prior), ControllerConfig()
     if not only_chart:
         done = {key(line) for line in read_lines(results)}
-        rate = _rate(128 if quick else 1024)
+        rate = base_rate(128 if quick else 1024, config=config.observe)
         for method in (m for m in ASKED if m.name in names):
             told = {"digest": digest([settings_of(method, config), asdict(config)], quick)}
             own = {"prior": loaded.hash, "method": method.name, "settings": told, "condition": BEHIND, "seed": seed}
             count = min(n, slow) if method is FROM_PRIOR else n
-            for number, view in views(BEHIND, count, lambda number: key({**own, "object": number}) in done):  # noqa: B023
+
+            def known(number: int, own: Line = own) -> bool:
+                return key({**own, "object": number}) in done
+
+            for number, view in views(BEHIND, count, known):
                 if view is None:
                     continue
                 found, sampled, positions = answer(method, Question(view, loaded, config, seed))
@@ -141,66 +150,53 @@ def main(
     lines = [x for x in newest(read_lines(results), loaded.hash, seed) if x["method"] in names]
     if not lines:
         raise ValueError(f"{results} has no results of this prior and these methods; leave --only-chart")
-    drawn = jax.random.normal(jax.random.key(0), (1000, loaded.model.latent))
+    drawn = jax.random.normal(jax.random.key(0), (PRIOR_SHAPES, loaded.model.latent))
     rows = _rows(lines, float(has_handle(loaded.model, drawn).mean()))
     _draw(lines, out / "handle.png")
     return rows
 
 
-@cache
-def _rate(objects: int) -> Float[np.ndarray, "32 32 32"]:
-    return base_rate(objects, config=ControllerConfig().observe)
-
-
 def _rows(lines: Sequence[Line], prior_says: float) -> list[Row]:
+    """Every method's means, shares by p and differences from the controller's, object by object; shown as a table."""
+    own = [x for x in lines if x["method"] == OWN] or [x for x in lines if x["method"] == lines[0]["method"]]
+    says = {"method": PRIOR, "p": prior_says, "shapes": PRIOR_SHAPES}
+    lines = [*lines, *({**says, "object": x["object"], "handle": x["handle"]} for x in own)]
     rows, cells = [], []
-    reference = {x["object"]: x for x in lines if x["method"] == OWN}
-
-    def judge(name: str, p: np.ndarray, own: Sequence[Line], shapes: int) -> None:
-        true = np.array([x["handle"] for x in own])
-        values = {
-            "said": (p, ""), "true": (true * 1.0, ""),
-            "log_score": (log_score(p, true, shapes), "nats"), "brier": ((p - true) ** 2, ""),
-        }  # fmt: skip
-        if name != PRIOR:
-            values |= {metric: (np.array([x[metric] for x in own]), unit) for metric, unit in MEASURED.items()}
-        for metric, (each, unit) in values.items():
-            rows.extend(mean_rows("handle", name, BEHIND, metric, each, unit))
-        for low, high, inside in _bins(p):
-            told = f"where p is {low:g} to {high:g}"
-            rows.append(Row("handle", name, BEHIND, f"said {told}", float(p[inside].mean()), "", int(inside.sum())))
-            rows.append(Row("handle", name, BEHIND, f"true {told}", float(true[inside].mean()), "", int(inside.sum())))
-        gaps = ["", ""]
-        both = [i for i, x in enumerate(own) if x["object"] in reference]
-        for column, metric in enumerate(("log_score", "hidden_nll")):
-            if name == OWN or metric not in values or not both:
-                continue
-            others = [reference[own[i]["object"]] for i in both]
-            theirs = [_scored(x) if metric == "log_score" else x["hidden_nll"] for x in others]
-            gap = paired_interval(values[metric][0][both], np.array(theirs))
-            for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
-                rows.append(Row("handle", name, BEHIND, f"{metric}_above_controller{label}", value, "nats", gap.n))
-            gaps[column] = f"{gap.mean:+.3f} ({gap.low:+.3f}..{gap.high:+.3f})"
-        shown = [interval(each) for each, _ in values.values()]
-        ends = [f"{i.mean:.3f} ({i.low:.2f}..{i.high:.2f})" for i in shown[:4]]
-        cells.append([name, str(len(own)), *ends, f"{shown[4].mean:.3f}" if len(shown) > 4 else "", *gaps])
-
-    for method in (m.name for m in ASKED):
+    reference: dict[str, dict[int, float]] = {}  # the controller's, by metric and object
+    for method in (*(m.name for m in ASKED), PRIOR):
         own = [x for x in lines if x["method"] == method]
-        if own:
-            judge(method, np.array([x["p"] for x in own]), own, own[0]["shapes"])
-    own = list(reference.values()) or [x for x in lines if x["method"] == lines[0]["method"]]
-    judge(PRIOR, np.full(len(own), prior_says), own, 1000)
-    header = ("method", "n", "said", "true", "log score", "brier", "hidden_nll", "log score above ours", "nll above")
-    table("Is a handle behind it?", header, cells)
+        if not own:
+            continue
+        values, objects = _values(own), [x["object"] for x in own]
+        shown = {}
+        for metric, each in values.items():
+            rows += mean_rows("handle", method, BEHIND, metric, each, UNITS[metric])
+            i = interval(each)
+            shown[metric] = f"{i.mean:.3f} ({i.low:.2f}..{i.high:.2f})"
+        for low, high, inside in _bins(values["said"]):
+            for metric in ("said", "true"):
+                told, mean = f"{metric} where p is {low:g} to {high:g}", float(values[metric][inside].mean())
+                rows.append(Row("handle", method, BEHIND, told, mean, "", int(inside.sum())))
+        if method == OWN:
+            reference = {m: dict(zip(objects, each.tolist(), strict=True)) for m, each in values.items()}
+        for metric in [m for m in COMPARED if m in values and method != OWN]:
+            both = [k for k, number in enumerate(objects) if number in reference.get(metric, {})]
+            if not both:
+                continue
+            gap = paired_interval(values[metric][both], np.array([reference[metric][objects[k]] for k in both]))
+            for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
+                rows.append(Row("handle", method, BEHIND, f"{metric}_above_controller{label}", value, "nats", gap.n))
+            shown[f"{metric} above"] = f"{gap.mean:+.3f} ({gap.low:+.3f}..{gap.high:+.3f})"
+        cells.append([method, str(len(own)), *(shown.get(column, "") for column in COLUMNS)])
+    table("Is a handle behind it?", ("method", "n", *COLUMNS), cells)
     return rows
 
 
-MEASURED = {"hidden_nll": "nats", "point_gradients": ""}
-
-
-def _scored(line: Line) -> float:
-    return float(log_score(np.array([line["p"]]), np.array([line["handle"]]), line["shapes"])[0])
+def _values(lines: Sequence[Line]) -> dict[str, Float[np.ndarray, "n"]]:
+    """One method's measures, object by object."""
+    p, true, shapes = (np.array([x[name] for x in lines]) for name in ("p", "handle", "shapes"))
+    values = {"said": p, "true": true * 1.0, "log_score": log_score(p, true, shapes), "brier": (p - true) ** 2}
+    return values | {m: np.array([x[m] for x in lines]) for m in ("hidden_nll", "point_gradients") if m in lines[0]}
 
 
 def _bins(p: Float[np.ndarray, "n"]) -> list[tuple[float, float, Bool[np.ndarray, "n"]]]:

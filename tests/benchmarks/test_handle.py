@@ -68,7 +68,7 @@ def test_answers_are_kept_and_compared(tmp_path: Path, monkeypatch: pytest.Monke
 
     monkeypatch.setattr(handle, "views", views)
     monkeypatch.setattr(handle, "answer", answer)
-    monkeypatch.setattr(handle, "_rate", lambda _: np.full((32,) * 3, 0.5))
+    monkeypatch.setattr(handle, "base_rate", lambda *_, **__: np.full((32,) * 3, 0.5))
     monkeypatch.setattr(handle, "has_handle", lambda _, positions: np.array([True, False]))
     monkeypatch.setattr(handle, "score", lambda *_: SimpleNamespace(values={"hidden_nll": 0.2}))
     kept = tmp_path / "kept.jsonl"
