@@ -294,6 +294,7 @@ def _spread(
     """`count` of the candidates (or all, if fewer), evenly over the area that they cover.
 
     The candidates are halved along their longer side until every cell holds one wanted pixel; each cell draws its own.
+    Pixels of one row or column keep their order, so that every machine draws the same.
     """
     if len(candidates) <= count:
         return candidates
@@ -302,5 +303,5 @@ def _spread(
     first = count // 2
     cut = round(len(candidates) * first / count)
     side = int(np.ptp(pixels[candidates], axis=0).argmax())
-    order = candidates[np.argpartition(pixels[candidates, side], cut)]
+    order = candidates[np.argsort(pixels[candidates, side], kind="stable")]
     return np.append(_spread(pixels, order[:cut], first, rng), _spread(pixels, order[cut:], count - first, rng))
