@@ -188,7 +188,7 @@ def mesh(hypotheses: Hypotheses, index: int) -> tuple[Float[np.ndarray, "v 3"], 
     # inner wall is drawn.
     opacity = hypotheses.opacity[index]
     level = np.where(occupied, np.maximum(opacity, 128), np.minimum(opacity, 127)).astype(np.float32)
-    level[..., voxel_centres(hypotheses.grid)[0, 0, :, 2] < hypotheses.base[index]] = 0.0
+    level[..., voxel_centres(hypotheses.grid)[0, 0, :, 2] < min(hypotheses.base[index], BASE_Z)] = 0.0
     # With axes in the order x, y, z its "ascent" is what turns triangles counter-clockwise about a full inside.
     vertices, faces, _, _ = marching_cubes(np.pad(level, 1), 127.5, gradient_direction="ascent")
     cube = -1.0 + (vertices.astype(np.float64) - 0.5) * 2.0 / hypotheses.grid  # one voxel of padding

@@ -52,7 +52,9 @@ def solid(
     cannot reach from outside the cube becomes solid, and the dilation is taken back by an erosion: a closed can is
     solid, the cavity of an open cup is empty. (Filling between the two steps of the closing matters: a closing alone
     cannot seal a pinhole in a wall one or two voxels thick.) The support plane is no wall (a shape whose unseen bottom
-    is open is open), but nothing below `base` is occupied: what each shape stands on (z of the view frame).
+    is open is open), but a shape ends at `base`, on which it stands (z of the view frame): nothing below is occupied.
+    Where that is above the measured plane, the table is higher than measured, and fills what lies between: the shape's
+    lowest layer goes on down to the plane.
     """
     opacity = np.asarray(opacity)
     if opacity.ndim < 3 or len(set(opacity.shape[-3:])) != 1:
@@ -63,8 +65,14 @@ def solid(
     flat = walls.reshape(-1, grid, grid, grid)
     filled = np.stack([_fill(wall) for wall in flat]) if len(flat) else flat
     # Last, not first: a bottom that is drawn a little below the plane still seals the object.
-    below = _centre_z(grid) < np.asarray(base)[..., None]
-    return filled.reshape(walls.shape) & ~below[..., None, None, :]
+    bases = np.broadcast_to(np.asarray(base, np.float64), walls.shape[:-3]).ravel()
+    level = _centre_z(grid)
+    plane = np.searchsorted(level, BASE_Z)
+    for shape, lowest in zip(filled, np.searchsorted(level, bases), strict=True):
+        shape[..., : min(lowest, plane)] = False
+        if plane < lowest < grid:
+            shape[..., plane:lowest] = shape[..., lowest, None]
+    return filled.reshape(walls.shape)
 
 
 def voxel_surface(occupied: Bool[np.ndarray, "G G G"]) -> Float[np.ndarray, "n 3"]:

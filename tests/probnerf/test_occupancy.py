@@ -58,10 +58,18 @@ def test_the_plane_is_no_wall_but_nothing_below_it_is_occupied():
     assert not filled[voxel_centres(GRID)[..., 2] < BASE_Z].any()
 
 
-def test_each_shape_is_cut_at_the_height_that_it_stands_on():
+def test_each_shape_ends_at_the_height_that_it_stands_on_and_what_it_stands_on_is_solid():
     z, base = voxel_centres(GRID)[0, 0, :, 2], np.array([BASE_Z - 2.1 * WIDTH, BASE_Z, BASE_Z + 2.1 * WIDTH])
-    both = solid(np.ones((3, *(GRID,) * 3)), base)
-    np.testing.assert_array_equal(both[:, 5, 5], z >= base[:, None])
+    every = solid(np.ones((3, *(GRID,) * 3)), base)
+    np.testing.assert_array_equal(every[:, 5, 5], z >= np.minimum(base, BASE_Z)[:, None])
+    # the table, which is higher than measured there, has the outline that stands on it, whatever was drawn in it
+    cone = np.hypot(*np.moveaxis(voxel_centres(GRID)[..., :2], -1, 0)) < 0.3 + 0.4 * (z - BASE_Z)
+    stood = solid(cone.astype(np.float32), base[2])
+    lowest = int(np.flatnonzero(z >= base[2])[0])
+    for k in np.flatnonzero((z >= BASE_Z) & (z < base[2])):
+        np.testing.assert_array_equal(stood[..., k], stood[..., lowest])
+    np.testing.assert_array_equal(stood[..., lowest:], solid(cone.astype(np.float32))[..., lowest:])
+    assert cone[..., k].sum() < stood[..., k].sum() and not stood[..., z < BASE_Z].any()
 
 
 def test_the_border_of_the_cube_is_empty_space():
