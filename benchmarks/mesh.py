@@ -12,7 +12,7 @@ import trimesh
 from jaxtyping import Float
 from scipy import ndimage
 
-from benchmarks.scene import FINE, GRID, VesselView, ViewConfig, simulated_camera, stand
+from benchmarks.scene import FINE, GRID, VesselView, ViewConfig, in_table, simulated_camera, stand
 from calibration.camera import Camera
 from perception.observe import ObserveConfig, object_frame
 from perception.seen import seen_voxels
@@ -79,7 +79,7 @@ def mesh_view(path: Path, seed: int, config: ViewConfig | None = None) -> Vessel
         shape=None,
         T_canonical_view=np.eye(4),
         solid=coarsen(enclosed(in_cube, FINE), GRID),
-        seen=seen_voxels(faultless, found, cube, GRID),
+        seen=seen_voxels(faultless, found, cube, GRID) | in_table(GRID),
         near_handle=np.zeros((GRID,) * 3, bool),
     )
 

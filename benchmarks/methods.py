@@ -20,18 +20,17 @@ from jaxtyping import Array, Float
 
 from benchmarks.results import Line, digest
 from benchmarks.rivals import RivalConfig, encoder_alone, encoder_picture
-from benchmarks.scene import GRID, VesselView
-from benchmarks.score import Answer
+from benchmarks.scene import VesselView
+from benchmarks.score import Answer, shapes_at
 from perception.controller import ControllerConfig, estimate
 from perception.observe import ObjectFrame, observe
 from perception.seen import answered_voxels
 from probnerf.annealed import AnnealedHMCConfig
 from probnerf.baselines.map import map_estimate
 from probnerf.baselines.vi import VIConfig, mean_field
-from probnerf.infer import crossings_of, infer, likelihood_of, opacity_grids, scaled_about, without_sizes
+from probnerf.infer import crossings_of, infer, likelihood_of, scaled_about
 from probnerf.model import Likelihood, faces_of_view, log_likelihood
 from probnerf.modes import log_posterior
-from probnerf.occupancy import coarsen, solid
 from probnerf.populations import thin
 from probnerf.proposal import Picture, guesses
 from probnerf.store import Prior
@@ -282,7 +281,7 @@ def settings_of(method: Method, config: ControllerConfig) -> Line:
 
 
 def answer(method: Method, question: Question, short: bool = False) -> tuple[Answer, Sampled, Float[Array, "S d"]]:
-    """A method's published shapes, what they were made from, and the position of each."""
+    """A method's shapes (`shapes_at`), what they were made from, and the position of each."""
     begun = time.monotonic()
     sampled = method.sample(question, short)
     posterior, count = sampled.posterior, question.config.hypotheses
@@ -291,7 +290,7 @@ def answer(method: Method, question: Question, short: bool = False) -> tuple[Ans
     else:
         chosen = np.arange(len(posterior.log_weights))
         weights = np.exp(np.asarray(posterior.log_weights, np.float64))
-    model, sizeless = question.prior.model, without_sizes(sampled.likelihood)
+    model = question.prior.model
     positions, pose_sigma = posterior.positions[jnp.asarray(chosen)], sampled.observation.pose_sigma
     if sampled.cube.sight_sigma > 0.0 and len(chosen) > 1:  # as perception publishes; one best shape is no draw
         drawn = jax.random.normal(jax.random.fold_in(question.key, 1), posterior.log_weights.shape)
@@ -300,7 +299,6 @@ def answer(method: Method, question: Question, short: bool = False) -> tuple[Ans
         positions = scaled_about(model, positions, pose_sigma, camera, factor)
     view = question.view
     asked = jnp.asarray(answered_voxels(view.frame, view.segment, sampled.cube, question.config.grid))
-    opacity = opacity_grids(model, sizeless, positions, pose_sigma, asked)
-    shapes = coarsen(solid(np.asarray(opacity)), GRID)
+    shapes = shapes_at(model, sampled.likelihood, positions, pose_sigma, asked)
     seconds = time.monotonic() - begun if sampled.seconds is None else sampled.seconds
     return Answer(shapes, weights / weights.sum(), seconds, posterior.result), sampled, positions

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from benchmarks.results import refuse_cut
 from benchmarks.scene import GRID, VesselView
-from benchmarks.score import Answer
+from benchmarks.score import Answer, shapes_at
 from perception.controller import ControllerConfig, estimate
 from perception.crop import crop
 from perception.observe import ObjectFrame, observe
@@ -19,9 +19,9 @@ from perception.seen import answered_voxels
 from perception.segment import Segment
 from perception.source import Frame
 from probnerf.baselines.map import MAPConfig, map_estimate
-from probnerf.infer import encoder_guess, likelihood_of, opacity_grids
+from probnerf.infer import encoder_guess, likelihood_of
 from probnerf.model import Likelihood
-from probnerf.occupancy import coarsen, solid
+from probnerf.occupancy import coarsen
 from probnerf.prior import ProbNeRF
 from probnerf.proposal import Picture, guesses
 from probnerf.store import Prior
@@ -67,8 +67,7 @@ def answers(
     asked = jnp.asarray(answered_voxels(vessel.frame, vessel.segment, cube, config.grid))
 
     def answer(positions: Array, weights: np.ndarray, begun: float) -> Answer:
-        opacity = opacity_grids(model, likelihood, positions, observation.pose_sigma, asked)
-        shapes = coarsen(solid(np.asarray(opacity)), GRID)
+        shapes = shapes_at(model, likelihood, positions, observation.pose_sigma, asked)
         return Answer(shapes, weights, time.monotonic() - begun)
 
     if PRIOR in methods:

@@ -27,8 +27,8 @@ from probnerf.families.tabletop import (
     sample_objects,
     to_canonical,
 )
-from probnerf.occupancy import coarsen, solid
-from probnerf.types import Pose
+from probnerf.occupancy import coarsen, solid, voxel_centres
+from probnerf.types import BASE_Z, Pose
 
 GRID = 32  # voxels per axis that answers are judged on
 FINE = 64  # voxels per axis of the truth, before it is coarsened as the hypotheses are
@@ -80,7 +80,7 @@ class VesselView:
     shape: TabletopObject | None  # None: none of the family
     T_canonical_view: Float[np.ndarray, "4 4"]  # affine: from the view's cube to the shape's, cube units both
     solid: Bool[np.ndarray, "32 32 32"]
-    seen: Bool[np.ndarray, "32 32 32"]  # by the true geometry; without depth, in silhouette
+    seen: Bool[np.ndarray, "32 32 32"]  # by the true geometry (without depth, in silhouette), or in the table
     near_handle: Bool[
         np.ndarray, "32 32 32"
     ]  # outside the body, where the true handle passes as it turns about the axis
@@ -149,10 +149,15 @@ def vessel_view(
         shape=placed.shape,
         T_canonical_view=T_canonical_view,
         solid=coarsen(solid((body | handle).astype(np.float32)), GRID),
-        seen=seen_voxels(faultless, found, cube, GRID),
+        seen=seen_voxels(faultless, found, cube, GRID) | in_table(GRID),
         near_handle=swept & ~coarsen(body, GRID),
         pose_known=pose_known,
     )
+
+
+def in_table(grid: int) -> Bool[np.ndarray, "g"]:
+    """Which layers of voxels lie under the plane, by i_z: there is nothing to be seen, and truths end above."""
+    return np.asarray(voxel_centres(grid)[0, 0, :, 2] < BASE_Z)
 
 
 def told_pose(T_world_camera: Float[np.ndarray, "4 4"], seed: int) -> Float[np.ndarray, "4 4"]:

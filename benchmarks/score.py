@@ -13,6 +13,7 @@ from perception.hypotheses import Hypotheses
 from perception.query import CAUTION
 from probnerf import foam
 from probnerf.families.render import look_at, pinhole_rays, trace
+from probnerf.infer import opacity_grids, poses, without_sizes
 from probnerf.metrics import (
     hidden_brier,
     hidden_ece,
@@ -22,10 +23,10 @@ from probnerf.metrics import (
     scored_voxels,
     smooth_probability,
 )
-from probnerf.model import Likelihood, split_position
-from probnerf.occupancy import coarsen
+from probnerf.model import Likelihood, Model, split_position
+from probnerf.occupancy import coarsen, solid
 from probnerf.prior import ProbNeRF
-from probnerf.types import Rays
+from probnerf.types import BASE_Z, Rays
 from probnerf.views import ENCODER_RADIUS
 
 BOXES = 16  # random unseen boxes per view
@@ -43,6 +44,20 @@ class Answer:
     @property
     def p_occupied(self) -> Float[np.ndarray, "32 32 32"]:
         return np.tensordot(self.weights, self.shapes, 1)
+
+
+def shapes_at(
+    model: Model,
+    likelihood: Likelihood,
+    positions: Float[Array, "S d"],
+    pose_sigma: Float[Array, "5"],
+    asked: Bool[Array, "g g g"],
+) -> Bool[np.ndarray, "S 32 32 32"]:
+    """The solid shape of each position, as `Hypotheses.solid` would have it."""
+    sizeless = without_sizes(likelihood)
+    opacity = opacity_grids(model, sizeless, positions, pose_sigma, asked)
+    z = poses(model, sizeless, positions, pose_sigma).z
+    return coarsen(solid(np.asarray(opacity), BASE_Z + np.asarray(z)), GRID)
 
 
 def as_queried(h: Hypotheses, seconds: float) -> Answer:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -18,16 +19,17 @@ from benchmarks.frame import (
 from benchmarks.hidden import judge
 from benchmarks.prior import VIEWS, see
 from benchmarks.rivals import METHODS, POSTERIOR
-from benchmarks.scene import base_rate, hidden_vessel, told_pose, vessel_picture, vessel_view
-from benchmarks.score import Answer, random_boxes
+from benchmarks.scene import GRID, base_rate, hidden_vessel, told_pose, vessel_picture, vessel_view
+from benchmarks.score import Answer, random_boxes, shapes_at
 from benchmarks.summary import mean_rows
 from perception.controller import ControllerConfig, estimate
 from perception.monocular import PlaneGuess
 from perception.plane import heights
+from perception.seen import answered_voxels
 from perception.segment import segment
 from perception.source import read_frame_folder
 from probnerf.infer import InferConfig, quick_smc
-from probnerf.occupancy import voxel_centres
+from probnerf.occupancy import coarsen, voxel_centres
 from probnerf.store import load_prior
 from probnerf.types import BASE_Z
 
@@ -79,14 +81,15 @@ def test_where_the_pose_is_known_the_cube_is_the_object_s_own_and_only_its_shape
 
 
 def test_without_depth_what_counts_as_seen_tells_nothing_of_where_the_surface_is():
-    """Every voxel on a ray to the object counts as unseen, before the surface as behind it."""
+    """Every voxel above the table on a ray to the object counts as unseen, before the surface as behind it."""
     picture = vessel_picture(2_000_001, "hidden")
     assert picture is not None
     view = vessel_view(picture, depth=False)
     assert not (view.solid & view.seen).sum() > 0.03 * view.solid.sum()
-    camera = view.cube.to_camera(voxel_centres(32).reshape(-1, 3))
-    u, v = np.round(view.frame.camera.project(camera)).astype(int).T
+    centres = voxel_centres(32).reshape(-1, 3)
+    u, v = np.round(view.frame.camera.project(view.cube.to_camera(centres))).astype(int).T
     on_object = view.segment.mask[v.clip(0, view.segment.mask.shape[0] - 1), u.clip(0, view.segment.mask.shape[1] - 1)]
+    on_object &= centres[:, 2] >= BASE_Z
     assert not view.seen.ravel()[on_object].any() and on_object.sum() > 2 * view.solid.sum()
 
 
@@ -191,3 +194,19 @@ def test_free_points_of_the_real_frame_are_free_and_unseen(shared_data):
     for other in truth.values():
         assert not other.box_holds(points, 0.0).any()
         assert np.linalg.norm(points[::50, None] - other.in_camera[None], axis=-1).min() >= 0.015
+
+
+def test_shapes_are_those_that_are_published(vessel):
+    prior, config = load_prior(None), ControllerConfig(infer=InferConfig(smc=quick_smc(2, 4)), hypotheses=8, runs=1)
+    found = estimate(vessel.frame, vessel.segment, prior, config, stages=2)
+    h, posterior = found.hypotheses, found.posterior
+    assert len(posterior.positions) == len(h.weights)  # all of them, in their order
+    asked = jnp.asarray(answered_voxels(vessel.frame, vessel.segment, found.object_frame, config.grid))
+    shapes = shapes_at(prior.model, found.likelihood, posterior.positions, found.observation.pose_sigma, asked)
+    np.testing.assert_array_equal(shapes, coarsen(h.solid, GRID))
+
+
+def test_space_in_the_table_is_not_unseen(vessel):
+    in_it = voxel_centres(GRID)[0, 0, :, 2] < BASE_Z
+    assert vessel.seen[..., in_it].all() and not vessel.solid[..., in_it].any()
+    assert not vessel.seen[..., ~in_it][..., 0].all()
