@@ -7,10 +7,12 @@ and no shape that the prior does not know: what is wrong here is the sampler's, 
 (`farside bench hidden`) is the model's. Statistics, each of the shape on 24^3 voxels:
 
 - volume: of the whole shape; hidden: of its half away from the camera; voxel: whether one random far voxel is solid
-- yaw (where the pose is unknown); log_likelihood of the pixels
+- yaw (where the pose is unknown); delta: mean square of the weights' perturbation, where that is sampled, of which a
+  picture tells next to nothing; log_likelihood of the pixels
 
-The quick sampler is what ships, but that all of its particles start from the prior, as no picture is drawn that the
-encoder could read, and that there is one run.
+The tiny field is a ProbNeRF with the weights that it begins training with: shapes like clouds, and few enough weights
+for 200 draws with delta. The quick sampler is what ships, but that all of its particles start from the prior, as no
+picture is drawn that the encoder could read, and that there is one run.
 
 outside: how far the ranks' distribution function leaves the band that 95% of uniform samples stay in as a whole
 (`metrics.uniform_band`), 0 where it stays inside. coverage90: share of truths in the central 90%.
@@ -34,9 +36,10 @@ from benchmarks.summary import say, table
 from probnerf.analytic import draw_pixels, grid_of_rays
 from probnerf.infer import InferConfig, likelihood_of, likelihood_settings, opacity_grids
 from probnerf.metrics import coverage, ks_distance, randomised_rank, uniform_band
-from probnerf.model import CylinderModel, Likelihood, Model, faces_of_view, log_likelihood, pose_of
+from probnerf.model import POSE_SIZE, CylinderModel, Likelihood, Model, faces_of_view, log_likelihood, pose_of
 from probnerf.occupancy import solid, voxel_centres
 from probnerf.populations import thin
+from probnerf.prior import PRESETS, ProbNeRF
 from probnerf.smc import TemperedSMCConfig, tempered_smc
 from probnerf.store import load_prior
 from probnerf.types import Posterior
@@ -44,7 +47,7 @@ from probnerf.types import Posterior
 RESULTS = Path(__file__).with_suffix(".jsonl")
 GRID = 24
 POSE_SIGMA = (0.08, 0.08, 0.06, 0.02, 0.03)  # of perception's usual widths, cube units
-STATISTICS = ("volume", "hidden", "voxel", "yaw", "log_likelihood")
+STATISTICS = ("volume", "hidden", "voxel", "yaw", "delta", "log_likelihood")
 DRAWS = 64  # posterior samples that ranks are taken among
 
 
@@ -57,25 +60,34 @@ class Condition:
     sampler: TemperedSMCConfig
     pose: bool = True
     delta: bool = False
-    columns: int = 8  # pixels: columns x rows
-    rows: int = 8
-    lattice: int = 32
+    columns: int = 6  # pixels: columns x rows
+    rows: int = 5
+    lattice: int = 12
 
 
 def _prior() -> Model:
     return load_prior(None).model
 
 
+def _tiny() -> Model:
+    return ProbNeRF(PRESETS["tiny"], jax.random.key(0))
+
+
+def _on_prior(name: str, sampler: TemperedSMCConfig, pose: bool = True) -> Condition:
+    return Condition(name, _prior, sampler, pose, columns=8, rows=8, lattice=32)
+
+
 THOROUGH = TemperedSMCConfig(populations=2, particles=96, start_particles=768, moves=4, final_stages=2, keep=2)
 QUICK = replace(InferConfig().smc_from_prior, evidence_power=1.0)  # what ships, but for its starts, runs and weights
 CONDITIONS = (
-    Condition("cylinder", CylinderModel, TemperedSMCConfig(), columns=6, rows=5, lattice=12),
-    Condition("shipped prior, pose known", _prior, THOROUGH, pose=False),
-    Condition("shipped prior", _prior, THOROUGH),
-    Condition("shipped prior, delta", _prior, THOROUGH, delta=True),
-    Condition("cylinder, quick sampler", CylinderModel, QUICK, columns=6, rows=5, lattice=12),
-    Condition("shipped prior, quick sampler", _prior, QUICK),
-    Condition("shipped prior, quick sampler, root of the evidence", _prior, replace(QUICK, evidence_power=0.5)),
+    Condition("cylinder", CylinderModel, TemperedSMCConfig()),
+    Condition("cylinder, pose known", CylinderModel, TemperedSMCConfig(), pose=False),
+    Condition("tiny field, delta", _tiny, TemperedSMCConfig(), delta=True),
+    Condition("tiny field, delta, pose known", _tiny, TemperedSMCConfig(), pose=False, delta=True),
+    _on_prior("shipped prior, pose known", THOROUGH, pose=False),
+    _on_prior("shipped prior", THOROUGH),
+    Condition("cylinder, quick sampler", CylinderModel, QUICK),
+    _on_prior("shipped prior, quick sampler", QUICK),
 )
 
 
@@ -96,9 +108,12 @@ def statistics(
         "hidden": shapes[:, far].sum(axis=1),
         "voxel": shapes[:, far[voxel % len(far)]],
     }
+    rest = positions[:, model.latent :]
     if likelihood.sample_pose:
-        k = model.latent
-        found["yaw"] = np.asarray(pose_of(positions[:, k : k + 7], pose_sigma).yaw)
+        pose, rest = rest[:, :POSE_SIZE], rest[:, POSE_SIZE:]
+        found["yaw"] = np.asarray(pose_of(pose, pose_sigma).yaw)
+    if likelihood.sample_delta:
+        found["delta"] = np.mean(np.square(np.asarray(rest)), axis=1)
     return {name: np.asarray(value, np.float64) for name, value in found.items()}
 
 
@@ -137,7 +152,7 @@ def identity(condition: Condition, prior: str) -> Line:
     told |= {"pixels": [condition.columns, condition.rows], "grid": GRID, "draws": DRAWS, "widths": POSE_SIGMA}
     settings = {"digest": digest(told)}
     same = {"method": "tempered_smc", "condition": condition.name, "settings": settings, "seed": 0}
-    return {"prior": "" if condition.model is CylinderModel else prior, **same}
+    return {"prior": prior if condition.model is _prior else "", **same}
 
 
 def main(
@@ -192,9 +207,9 @@ def main(
     return rows
 
 
-def outside(ranks: Float[np.ndarray, "n"]) -> float:
-    """The farthest that the ranks' distribution function leaves its simultaneous 95% band."""
-    at, low, high = uniform_band(len(ranks))
+def outside(ranks: Float[np.ndarray, "n"], level: float = 0.95) -> float:
+    """The farthest that the ranks' distribution function leaves the simultaneous band that holds `level` of samples."""
+    at, low, high = uniform_band(len(ranks), level)
     share = np.mean(np.asarray(ranks)[:, None] <= at, axis=0)
     return float(max(0.0, np.max(low - share), np.max(share - high)))
 
@@ -215,6 +230,7 @@ def _draw(found: dict[str, dict[str, np.ndarray]], path: Path) -> None:
         ax.set(title=name, xlabel="rank of the truth")
         ax.title.set_fontsize(9)
     axes[0, 0].set_ylabel("share of ranks below, less uniform")
-    axes[0, 0].legend(fontsize=7)
+    drawn = dict(pair for ax in axes.flat for pair in zip(*reversed(ax.get_legend_handles_labels()), strict=True))
+    axes[0, 0].legend(drawn.values(), drawn.keys(), fontsize=7)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)

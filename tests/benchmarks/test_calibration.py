@@ -80,12 +80,18 @@ def test_ranks_that_are_there_are_not_made_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_tempered_smc_is_calibrated_on_the_analytic_field() -> None:
-    condition = CONDITIONS[0]
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    ("name", "asked"),
+    [("cylinder", set(STATISTICS) - {"delta"}), ("tiny field, delta, pose known", set(STATISTICS) - {"yaw"})],
+)
+def test_tempered_smc_is_calibrated(name: str, asked: set[str], draws: int = 50) -> None:
+    """Processors round otherwise, which draws all ranks anew: a right sampler may fail on one in a hundred."""
+    (condition,) = (c for c in CONDITIONS if c.name == name)
     model = condition.model()
-    answers = [ranks_of(condition, model, seed) for seed in range(100, 150)]
+    answers = [ranks_of(condition, model, seed) for seed in range(100, 100 + draws)]
     assert {posterior.result for _, posterior in answers} == {"converged"}
     ranks = [found for found, _ in answers]
-    assert set(ranks[0]) == set(STATISTICS)
-    for name in STATISTICS:
-        assert outside(np.array([r[name] for r in ranks])) <= 0.03, name
+    assert set(ranks[0]) == asked
+    for statistic in asked:
+        assert outside(np.array([r[statistic] for r in ranks]), 1.0 - 0.01 / len(asked)) == 0.0, statistic
