@@ -89,6 +89,7 @@ class Estimate:
     object_frame: ObjectFrame
     seconds: float
     log: tuple[str, ...] = ()  # why there were more runs, and why no more, a line an answer
+    parts: dict[str, float] = field(default_factory=dict)  # s; of them: climbing, sampling, publishing
 
 
 def estimate(
@@ -187,7 +188,10 @@ def infer_view(
         on_answer(work.answer)
     found = pooled(runs, work.smc.evidence_power)
     seconds = time.monotonic() - begun
-    return Estimate(work.answer, found, work.likelihood, view.observation, view.object_frame, seconds, tuple(log))
+    work.turn_to("")
+    return Estimate(
+        work.answer, found, work.likelihood, view.observation, view.object_frame, seconds, tuple(log), work.parts
+    )
 
 
 @dataclass(eq=False)
@@ -214,6 +218,9 @@ class _Work:
     answering: float = 0.0  # s; and what it took
     stage_s: list[float] = field(default_factory=list)  # s; each stage of the latest run
     since: float = 0.0  # when the stage at hand began
+    parts: dict[str, float] = field(default_factory=dict)  # s; by what was done
+    part: str = ""  # what is being done
+    turned: float = field(default_factory=time.monotonic)  # since when
 
     @cached_property
     def likelihood(self) -> Likelihood:
@@ -233,6 +240,13 @@ class _Work:
             return None
         return crop(self.view.frame, self.view.segment, self.view.object_frame, self.prior.model.preset.image_size)
 
+    def turn_to(self, part: str) -> None:
+        """What time goes to from now on; "": nothing that is counted."""
+        now = time.monotonic()
+        if self.part:
+            self.parts[self.part] = self.parts.get(self.part, 0.0) + now - self.turned
+        self.part, self.turned = part, now
+
     def sample(self, run: int) -> Posterior:
         """One run of `infer`; other threads' wait."""
         with _ONE_AT_A_TIME:
@@ -241,8 +255,10 @@ class _Work:
     def _sampled(self, run: int) -> Posterior:
         observation = self.view.observation
         key = jax.random.key(self.seed)
+        self.turn_to("climbing")
         if not self.searched and self.before is None:
             self._search(jax.random.fold_in(key, 1))
+        self.turn_to("sampling")
         self.stage_s, self.since = [], time.monotonic()
         posterior, likelihood = infer(
             jax.random.fold_in(key, 10 + run) if run else key,
@@ -256,6 +272,7 @@ class _Work:
             deadline=self.deadline,
             stages=None if self.cap is None else self.cap - self.stages,
         )
+        self.turn_to("")
         self.stages += int(posterior.diagnostics.stages)
         self.point_gradients += float(posterior.diagnostics.point_gradients) * crossings_of(likelihood, observation)
         return posterior
@@ -268,7 +285,7 @@ class _Work:
         assert isinstance(model, ProbNeRF) and self.picture is not None
         if self.on_answer is not None and self.fresh:
             self._answer(encoder_guess(key, model, self.likelihood, self.view.observation, self.picture))
-        self.reference = modes_of(key, model, self.view.observation, config, self.picture)
+        self.reference = jax.block_until_ready(modes_of(key, model, self.view.observation, config, self.picture))
         climbed = config.modes.gradients(self.likelihood.dim(model))
         self.point_gradients += climbed * crossings_of(self.likelihood, self.view.observation)
 
@@ -277,9 +294,9 @@ class _Work:
             return True
         now = time.monotonic()
         self.stage_s.append(now - self.since)
-        # without an encoder's guess the first answer at once; a later one when the time it takes is a fifth of what
+        # without an encoder's guess the first answer at once; a later one when the time it takes is a tenth of what
         # went by; none that is underway once a run is whole
-        if self.on_answer is not None and self.answer is None and now - self.answered >= 4.0 * self.answering:
+        if self.on_answer is not None and self.answer is None and now - self.answered >= 9.0 * self.answering:
             self._answer(info.samples())
         self.since = time.monotonic()
         return None
@@ -294,9 +311,12 @@ class _Work:
 
     def publish(self, posterior: Posterior, count: int) -> Hypotheses:
         """The samples at hand as planners read them."""
+        before = self.part
+        self.turn_to("publishing")
         more = {"point_gradients": self.point_gradients, "evidence_power": self.smc.evidence_power}
         config = replace(self.config, hypotheses=count)
         h = published(self.view, posterior, self.likelihood, self.prior, config, self.seed, more)
+        self.turn_to(before)
         return replace(h, stage=max(self.stages, h.stage))
 
     def short_of(self) -> str | None:

@@ -42,6 +42,8 @@ def test_where_little_is_asked_one_run_is_all() -> None:
     assert found.hypotheses is told[-1] and found.hypotheses.result == "converged"
     assert all(h.result == "underway" for h in told[:-1]) and len(told[0].weights) == CONFIG.first_hypotheses
     assert found.posterior.positions.shape[0] == 20
+    assert found.parts.keys() >= {"sampling", "publishing"} and min(found.parts.values()) > 0.0
+    assert 0.5 * found.seconds < sum(found.parts.values()) <= found.seconds
 
 
 @pytest.mark.slow
