@@ -40,6 +40,7 @@ from probnerf.store import load_prior
 EASY, HARD = CONDITIONS = ("plain can, seen well", "printed pitcher, half hidden")
 CONTROLLER, LARGEST = METHODS = ("controller", "largest model")
 METRICS = {"point_gradients": "", "first_answer": "s", "seconds": "s", "hidden_nll": "nats"}
+PARTS = ("climbing", "sampling", "publishing")  # of the seconds; the rest is to observe
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +111,8 @@ def main(out: Path, quick: bool = False, prior: Path | None = None, n: int = 8, 
         boxes = random_boxes(scored_voxels(view.seen, rate), 1, rng)
         judged = score(view, Answer(coarsen(h.solid, GRID), h.weights, found.seconds), rate, boxes, rng)
         cost = {"point_gradients": h.diagnostics["point_gradients"], "first_answer": told[0], "seconds": told[-1]}
-        return {**cost, "hidden_nll": judged.values["hidden_nll"]}, found
+        parts = {part: found.parts.get(part, 0.0) for part in PARTS}
+        return {**cost, **parts, "hidden_nll": judged.values["hidden_nll"]}, found
 
     for condition in CONDITIONS:
         for view in scenes(condition, n):
@@ -136,16 +138,16 @@ def main(out: Path, quick: bool = False, prior: Path | None = None, n: int = 8, 
 
 
 def _rows(spent: dict[str, list[Spent]]) -> list[Row]:
-    rows, lines = [], []
+    rows, lines, none = [], [], [""] * len(PARTS)
 
     def column(condition: str, method: str, metric: str) -> list[float]:
         return [s.values[method][metric] for s in spent[condition]]
 
     for condition in CONDITIONS:
         for method in METHODS:
-            for metric, unit in METRICS.items():
+            for metric, unit in (METRICS | dict.fromkeys(PARTS, "s")).items():
                 rows += mean_rows("effort", method, condition, metric, column(condition, method, metric), unit)
-            cells = [f"{interval(column(condition, method, metric)).mean:.3g}" for metric in METRICS]
+            cells = [f"{interval(column(condition, method, metric)).mean:.3g}" for metric in (*METRICS, *PARTS)]
             lines.append([condition, method, *cells])
         gap = paired_interval(
             *(np.array(column(condition, method, "hidden_nll")) for method in (CONTROLLER, LARGEST)),
@@ -153,13 +155,19 @@ def _rows(spent: dict[str, list[Spent]]) -> list[Row]:
         for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
             rows.append(Row("effort", CONTROLLER, condition, f"nll_above_largest{label}", value, "nats", gap.n))
         lines.append(
-            [condition, "controller's nll above the largest's, 95%", "", "", "", f"{gap.low:+.3f} .. {gap.high:+.3f}"]
+            [
+                condition,
+                "controller's nll above the largest's, 95%",
+                *[""] * 3,
+                f"{gap.low:+.3f} .. {gap.high:+.3f}",
+                *none,
+            ]
         )
     for metric in ("point_gradients", "seconds"):
         easy, hard = (float(np.mean(column(condition, CONTROLLER, metric))) for condition in CONDITIONS)
         rows.append(Row("effort", CONTROLLER, "easy over hard", metric, easy / hard, "", len(spent[EASY])))
-        lines.append(["easy over hard (aim: 0.2)", metric, f"{easy / hard:.3f}", "", "", ""])
-    table("What scenes cost", ("condition", "method", *METRICS), lines)
+        lines.append(["easy over hard (aim: 0.2)", metric, f"{easy / hard:.3f}", "", "", "", *none])
+    table("What scenes cost", ("condition", "method", *METRICS, *PARTS), lines)
     return rows
 
 
