@@ -11,8 +11,8 @@ The first vessels of the test seeds with a handle for which there is a view that
 - seconds: of one object, from frame to solid grids; work: seconds x the speed of the machine's matrix product beside
   them, which another machine can be compared by.
 - point_gradients: see `benchmarks.methods`. The encoder alone has point_evaluations.
-- hidden_nll_above_paper, _above_smc: paired over objects with the paper's full schedule, and with one run
-  of the sampler, which levers are taken from one at a time.
+- hidden_nll_above_paper, _above_base: paired over objects with the paper's full schedule, and with one run of the
+  sampler, from which levers are taken one at a time (delta is added to the one that begins at the prior).
 
 Results are appended to a file, vessel by vessel, and what is there is not made again: Ctrl-C any time, and go on later.
 """
@@ -197,21 +197,17 @@ def _rows(lines: Sequence[Line]) -> list[Row]:
     rows = []
     for condition in CONDITIONS:
         here = [line for line in lines if line["condition"] == condition]
-        references = {
-            word: {line["object"]: line["hidden_nll"] for line in here if line["method"] == name}
-            for word, name in (("paper", FULL), ("smc", "smc"))
-        }
+        score = {(line["method"], line["object"]): line["hidden_nll"] for line in here}
         for method in METHODS:
             own = [line for line in here if line["method"] == method.name]
             if own:
-                rows += _method_rows(method.name, condition, own, references)
+                rows += _method_rows(method, condition, own, score)
     return rows
 
 
-def _method_rows(
-    method: str, condition: str, own: Sequence[Line], references: dict[str, dict[int, float]]
-) -> list[Row]:
-    name, rows = "frontier", []
+def _method_rows(asked: Method, condition: str, own: Sequence[Line], score: dict[tuple[str, int], float]) -> list[Row]:
+    """One method's rows; `score` is the hidden_nll of every method and object."""
+    name, method, rows = "frontier", asked.name, list[Row]()
     for metric, unit in UNITS.items():
         values = [line.get(metric, np.nan) for line in own]
         if metric == "work":
@@ -222,9 +218,9 @@ def _method_rows(
     ranks, p_free, occupied = (np.concatenate([line[k] for line in own]) for k in ("ranks", "p_free", "occupied"))
     rows.append(Row(name, method, condition, "ks", ks_distance(ranks), "", len(ranks)))
     rows.append(Row(name, method, condition, "falsely_free", falsely_free(p_free, occupied > 0), "", len(ranks)))
-    for word, reference in references.items():
-        both = [(line["hidden_nll"], reference[line["object"]]) for line in own if line["object"] in reference]
-        if not both or method == {"paper": FULL, "smc": "smc"}[word]:
+    for word, other in (("paper", FULL), ("base", asked.base)):
+        both = [(x["hidden_nll"], score[other, x["object"]]) for x in own if (other, x["object"]) in score]
+        if not both or method == other:
             continue
         gap = paired_interval(*np.array(both).T)
         for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
@@ -240,7 +236,7 @@ def _print(rows: Sequence[Row]) -> None:
         for method in dict.fromkeys(row.method for row in rows if row.condition == condition):
             row = {metric: r for (c, m, metric), r in value.items() if (c, m) == (condition, method)}
             gaps = []
-            for word in ("paper", "smc"):
+            for word in ("paper", "base"):
                 ends = [row.get(f"hidden_nll_above_{word}{end}") for end in ("", "_q025", "_q975")]
                 mean, low, high = (f"{end.value:+.3f}" if end else "" for end in ends)
                 gaps.append(f"{mean} ({low} .. {high})" if mean else "")
@@ -255,6 +251,6 @@ def _print(rows: Sequence[Row]) -> None:
             "work, TFLOP",
             "point_gradients",
             "nll above the paper's",
-            "above smc's",
+            "above smc's (delta: from the prior's)",
         )
         table(condition, header, lines)

@@ -115,20 +115,20 @@ def test_a_run_goes_on_where_it_was_cut(tmp_path: Path, monkeypatch: pytest.Monk
     out, file = tmp_path / "out", tmp_path / "results.jsonl"
 
     def run(**options):
-        return frontier.main(out, n=2, methods="map;paper 100x100", results=file, **options)
+        return frontier.main(out, n=2, methods="map;paper 100x100;fixed*", results=file, **options)
 
     run()
     assert len(made) == 8 and made[-1] == ()  # cut
     file.write_bytes(file.read_bytes()[:-9])
     rows = run()
-    assert made.count((10, "map")) == 2 and made.count((12, "map")) == 5 and made.count((12, FULL)) == 1
-    assert len(made) == 8 + 2  # what was cut off the file, and what was left
-    assert repr(run(only_chart=True)) == repr(run()) == repr(rows) and len(made) == 10
+    assert made.count((10, "map")) == 2 and made.count((12, "map")) == 4 and made.count((12, FULL)) == 5
+    assert len(made) == 8 + 8  # what was cut off the file, and what was left
+    assert repr(run(only_chart=True)) == repr(run()) == repr(rows) and len(made) == 16
     value = {(r.condition, r.method, r.metric): r for r in rows}
     gap = value["hidden, RGB-D", "map", "hidden_nll_above_paper"]
     assert gap.value == pytest.approx(0.21) and gap.n == 2
     assert value["hidden, colour only", "map", "hidden_nll"].n == 1  # the other one was refused
-    assert not any(r.method == FULL and "colour" in r.condition for r in rows)
+    assert {r.condition for r in rows if r.method == "fixed 20x100"} == {CONDITIONS[0]}
     assert value["hidden, RGB-D", "map", "coverage90"].value == 0.5
     assert value["hidden, RGB-D", "map", "work"].value == pytest.approx(0.1)
     draw_frontier([row for row in rows if row.condition == CONDITIONS[0]], out / "frontier.png")
