@@ -13,6 +13,8 @@ The first vessels of the test seeds with a handle for which there is a view that
 - point_gradients: see `benchmarks.methods`. The encoder alone has point_evaluations.
 - hidden_nll_above_paper, _above_base: paired over objects with the paper's full schedule, and with one run of the
   sampler, from which levers are taken one at a time (delta is added to the one that begins at the prior).
+- over all conditions: each vessel's mean of them, which are not independent, beside the paper's schedule's, and how
+  many times more it takes: fewer_point_gradients, less_work.
 
 Results are appended to a file, vessel by vessel, and what is there is not made again: Ctrl-C any time, and go on later.
 """
@@ -51,6 +53,7 @@ UNITS = {
     "point_gradients": "",
     "point_evaluations": "",
 }
+OVER_ALL = "over all conditions"
 REFUSED = "perception"  # the method of a line that says why a view is left out
 
 
@@ -202,6 +205,35 @@ def _rows(lines: Sequence[Line]) -> list[Row]:
             own = [line for line in here if line["method"] == method.name]
             if own:
                 rows += _method_rows(method, condition, own, score)
+    return rows + _over_all(lines)
+
+
+def _over_all(lines: Sequence[Line]) -> list[Row]:
+    """Of methods that answered every condition of a vessel, as the paper's schedule did."""
+    of = {(line["method"], line["condition"], line["object"]): line for line in lines}
+    rows = []
+    for method in METHODS:
+        vessels = [
+            v
+            for v in sorted({line["object"] for line in lines})
+            if all((name, c, v) in of for name in (method.name, FULL) for c in CONDITIONS)
+        ]
+        if not vessels:
+            continue
+        both = [[[of[name, c, v] for c in CONDITIONS] for v in vessels] for name in (method.name, FULL)]
+        own, paper = (np.array([[x["hidden_nll"] for x in each] for each in one]).mean(axis=1) for one in both)
+        rows += mean_rows("frontier", method.name, OVER_ALL, "hidden_nll", own, "nats")
+        if method.name != FULL:
+            gap = paired_interval(own, paper)
+            for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
+                name = f"hidden_nll_above_paper{label}"
+                rows.append(Row("frontier", method.name, OVER_ALL, name, value, "nats", gap.n))
+            cost = np.array(
+                [[[(x["point_gradients"], x["seconds"] * x["gflops"]) for x in each] for each in one] for one in both]
+            ).sum(axis=(1, 2))
+            for name, mine, theirs in zip(("fewer_point_gradients", "less_work"), *cost, strict=True):
+                if mine > 0:  # the encoder takes no gradients
+                    rows.append(Row("frontier", method.name, OVER_ALL, name, float(theirs / mine), "", gap.n))
     return rows
 
 
@@ -231,7 +263,7 @@ def _method_rows(asked: Method, condition: str, own: Sequence[Line], score: dict
 def _print(rows: Sequence[Row]) -> None:
     value = {(row.condition, row.method, row.metric): row for row in rows}
     shown = ("hidden_nll", "hidden_nll_handle", "psnr_heldout", "psnr_heldout_of_mean", "coverage90", "falsely_free")
-    for condition in dict.fromkeys(row.condition for row in rows):
+    for condition in dict.fromkeys(row.condition for row in rows if row.condition != OVER_ALL):
         lines = []
         for method in dict.fromkeys(row.method for row in rows if row.condition == condition):
             row = {metric: r for (c, m, metric), r in value.items() if (c, m) == (condition, method)}
@@ -254,3 +286,12 @@ def _print(rows: Sequence[Row]) -> None:
             "above smc's (delta: from the prior's)",
         )
         table(condition, header, lines)
+    lines = []
+    for method in dict.fromkeys(row.method for row in rows if row.condition == OVER_ALL):
+        names = ("hidden_nll", *(f"hidden_nll_above_paper{end}" for end in ("", "_q025", "_q975")))
+        found = [value.get((OVER_ALL, method, name)) for name in (*names, "fewer_point_gradients", "less_work")]
+        cells = [f"{row.value:.{d}f}" if row else "" for row, d in zip(found, (3, 3, 3, 3, 1, 1), strict=True)]
+        lines.append([method, str(value[OVER_ALL, method, "hidden_nll"].n), *cells])
+    if lines:
+        ratios = ("fewer point_gradients", "less work")
+        table(OVER_ALL, ("method", "n", "hidden_nll", "above the paper's", "from", "to", *ratios), lines)

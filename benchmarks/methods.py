@@ -278,7 +278,7 @@ METHODS = (
         smc={"leapfrog_steps": 6},
         conditions=TELLING,
     ),
-    _estimate("controller, 10 stages", "stages", "10 stages", stages=10, runs=None, conditions=TELLING),
+    _estimate("controller, 10 stages", "stages", "10 stages", stages=10, runs=None),
     *(_estimate(f"controller {s:g} s", "controller", f"{s:g} s", budget_s=s, runs=None) for s in (1.0, 3.0, 10.0)),
 )
 

@@ -131,6 +131,10 @@ def test_a_run_goes_on_where_it_was_cut(tmp_path: Path, monkeypatch: pytest.Monk
     assert {r.condition for r in rows if r.method == "fixed 20x100"} == {CONDITIONS[0]}
     assert value["hidden, RGB-D", "map", "coverage90"].value == 0.5
     assert value["hidden, RGB-D", "map", "work"].value == pytest.approx(0.1)
+    overall = {r.metric: r for r in rows if (r.condition, r.method) == (frontier.OVER_ALL, "map")}
+    assert overall["hidden_nll_above_paper"].value == pytest.approx(0.22)  # of the vessel that all answered
+    assert overall["hidden_nll"].n == 1 and overall["fewer_point_gradients"].value == overall["less_work"].value == 1.0
+    assert not any(r.condition == frontier.OVER_ALL and r.method == "fixed 20x100" for r in rows)
     draw_frontier([row for row in rows if row.condition == CONDITIONS[0]], out / "frontier.png")
     assert cv2.imread(str(out / "frontier.png")) is not None
     with pytest.raises(ValueError, match="no method 'nothing'"):
