@@ -16,6 +16,7 @@ from skimage.measure import marching_cubes
 
 from perception.observe import ObjectFrame
 from probnerf.occupancy import solid, voxel_centres, voxel_index, voxel_surface
+from probnerf.rigid import rigid
 from probnerf.types import BASE_Z
 
 FrameName = Literal["object", "camera", "world"]
@@ -55,6 +56,17 @@ class Hypotheses:
                 raise ValueError(f"{name} has shape {list(have)}; with this opacity it must be {list(want)}")
         if self.seen.dtype != np.bool_:
             raise ValueError(f"seen is {self.seen.dtype}; it must be bool")
+        poses = {"T_camera_object": self.object_frame.T_camera_object, "T_world_camera": self.T_world_camera}
+        for name, T in poses.items():
+            if T is not None and not (np.shape(T) == (4, 4) and rigid(T)):
+                raise ValueError(f"{name} is no rigid transform: {np.asarray(T).tolist()}")
+        plane, half_extent = self.object_frame.plane, self.object_frame.half_extent
+        if np.shape(plane) != (4,) or not np.isfinite(plane).all():
+            raise ValueError(f"plane is {np.asarray(plane).tolist()}; it must be four finite numbers")
+        if not 0 < half_extent < np.inf:
+            raise ValueError(f"half_extent is {half_extent}; it must be more than 0 m")
+        if not np.isfinite(self.pose).all():
+            raise ValueError("a pose is not finite")
         if not (np.all(self.weights >= 0) and abs(float(np.sum(self.weights)) - 1.0) < 1e-6):
             raise ValueError(f"weights must not be negative and must sum to 1, not {float(np.sum(self.weights)):.6g}")
 

@@ -20,6 +20,7 @@ from jaxtyping import Float, Float32, UInt64
 from perception.hypotheses import Hypotheses
 from probnerf.families.render import look_at, pinhole_rays
 from probnerf.occupancy import voxel_index
+from probnerf.rigid import rigid
 
 _HALF = 1.1  # cube units that a picture shows on each side of the cube's centre
 
@@ -92,11 +93,8 @@ def ring_of_views(h: Hypotheses, config: NextViewConfig | None = None) -> Float[
 def _check_rigid(T: Float[np.ndarray, "c 4 4"]) -> None:
     if T.ndim != 3 or T.shape[1:] != (4, 4) or not len(T):
         raise ValueError(f"candidate cameras have shape {list(T.shape)}; give [c, 4, 4] with c >= 1")
-    R = np.nan_to_num(T[:, :3, :3])
-    rigid = np.isfinite(T).all(axis=(1, 2)) & (np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2)) < 1e-3)
-    rigid &= (np.abs(T[:, 3] - [0, 0, 0, 1]).max(axis=1) < 1e-6) & (np.linalg.det(R) > 0)
-    if not rigid.all():
-        row = int(np.flatnonzero(~rigid)[0])
+    if not (fine := rigid(T)).all():
+        row = int(np.flatnonzero(~fine)[0])
         raise ValueError(
             f"candidate camera {row} is no rigid transform: {T[row].tolist()}; give T_object_camera in metres"
         )

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, Shaped, UInt8
 
 from calibration.camera import Camera
+from probnerf.rigid import rigid
 
 # The recording that ships with the project, read when no source is named.
 SHIPPED_LOG = Path(__file__).parent / "shipped.mcap"
@@ -277,6 +278,8 @@ def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
         meta["T_world_camera"] = _numbers(path, "T_world_camera", T, (4, 4))
         if not np.allclose(meta["T_world_camera"][3], [0, 0, 0, 1]):
             raise ValueError(f"{path}: T_world_camera has last row {T[3]}; it must be 0 0 0 1 (is it transposed?)")
+        if not rigid(meta["T_world_camera"]):
+            raise ValueError(f"{path}: T_world_camera {T} is no rotation with a translation (m) beside it")
     return meta
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from probnerf.families.render import look_at
+from probnerf.rigid import rigid
 from probnerf.views import ENCODER_RADIUS, ViewSet
 
 NO_RANGE = -1.0  # in a ViewSet: an object pixel whose distance is unknown
@@ -238,8 +239,7 @@ def _read_intrinsics(
 
 def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
     T = np.reshape(_numbers(path, _read_text(path), None, (16,), "a 4x4 transform"), (4, 4))
-    turns = np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3) and np.linalg.det(T[:3, :3]) > 0
-    if not turns or not np.allclose(T[3], [0, 0, 0, 1], atol=1e-6):
+    if not rigid(T):
         raise ValueError(f"{path} is no rigid transform (rotation, then 0 0 0 1 below); write T_world_camera")
     return T
 

@@ -228,6 +228,25 @@ def test_a_pickle_in_the_file_is_refused_and_never_run(tmp_path, mixed):
     assert not mark.exists()
 
 
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"T_camera_object": np.full((4, 4), np.nan)}, "T_camera_object is no rigid transform"),
+        ({"T_camera_object": np.eye(4)[:3]}, "T_camera_object is no rigid transform"),
+        ({"T_world_camera": np.diag([1.0, 2.0, 1.0, 1.0])}, "T_world_camera is no rigid transform"),
+        ({"plane": np.array([0.0, 0.0, 1.0])}, "plane is"),
+        ({"plane": np.full(4, np.nan)}, "plane is"),
+        ({"pose": np.full((4, 5), np.nan, np.float32)}, "a pose is not finite"),
+    ],
+)
+def test_a_place_that_is_none_is_damage(tmp_path, mixed, changed: dict[str, np.ndarray], says: str):
+    path = tmp_path / "object_3.npz"
+    save(path, mixed)
+    _rewrite(path, **changed)
+    with pytest.raises(ValueError, match=rf"object_3\.npz is damaged \({says}.*write it again"):
+        load(path)
+
+
 def test_a_folder_is_a_scene_ordered_by_object(tmp_path, mixed):
     for object_id in (11, 2):
         save(hypotheses_path(tmp_path, object_id), replace(mixed, object_id=object_id))

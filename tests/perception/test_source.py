@@ -119,6 +119,10 @@ def test_eight_bit_depth_is_refused(folder: Path) -> None:
             {"camera_matrix_px": K, "depth_unit_m": 0.001, "T_world_camera": [[0, 0, 0, 1]] * 3 + [[1, 2, 3, 1]]},
             "transp",
         ),
+        (
+            {"camera_matrix_px": K, "depth_unit_m": 0.001, "T_world_camera": np.diag([1, 2, 1, 1]).tolist()},
+            "no rotation",
+        ),
     ],
 )
 def test_a_wrong_meta_is_named(folder: Path, meta: object, says: str) -> None:
