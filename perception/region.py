@@ -100,11 +100,14 @@ def read_mesh(path: Path, width: float) -> Cells:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; give a mesh (.obj, .stl, .ply, .off or .glb, in metres)")
     try:
-        mesh = trimesh.load_mesh(path)
+        mesh = trimesh.load_mesh(path, process=False)  # which would drop vertices that are not finite, and their faces
     except Exception as error:  # whatever a reader of one of its formats meets
-        raise ValueError(f"{path} cannot be read as a mesh: {error}") from error
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
-        raise ValueError(f"{path} holds no triangles, or numbers that are none")
+        raise ValueError(f"{path} cannot be read as a mesh ({error}); export it again as .obj, .stl or .ply") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise ValueError(f"{path} holds no triangles; export it as a triangle mesh (points go to --points)")
+    if not (finite := np.isfinite(mesh.vertices).all(axis=1)).all():
+        row = int(np.flatnonzero(~finite)[0])
+        raise ValueError(f"{path}: vertex {row + 1} is {mesh.vertices[row].tolist()}; give finite numbers, in metres")
     cells = float(np.prod(np.ceil(mesh.extents / width) + 1))
     if cells > MOST_CELLS:
         size = " x ".join(f"{e:g}" for e in mesh.extents)

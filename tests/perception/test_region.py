@@ -66,11 +66,17 @@ def test_what_is_no_mesh_is_named(tmp_path: Path) -> None:
     for name, complaint in {
         "cut.glb": "cannot be read as a mesh",
         "points.obj": "holds no triangles",
-        "nan.obj": "numbers that are none",
+        "nan.obj": r"vertex 1 is \[nan, 0.0, 0.0\]",
         "words.txt": "cannot be read as a mesh",
     }.items():
         with pytest.raises(ValueError, match=complaint):
             read_mesh(tmp_path / name, 0.01)
+    whole = _box((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))  # one vertex that is none would not be missed, but for this
+    lines = _saved(tmp_path / "box.obj", whole).read_text().splitlines()
+    at = next(i for i, line in enumerate(lines) if line.startswith("v "))
+    (tmp_path / "part.obj").write_text("\n".join([*lines[:at], "v nan nan nan", *lines[at + 1 :]]))
+    with pytest.raises(ValueError, match="vertex 1 is"):
+        read_mesh(tmp_path / "part.obj", 0.01)
     with pytest.raises(ValueError, match="is it in metres"):
         read_mesh(_saved(tmp_path / "mm.stl", trimesh.creation.box((300.0, 300.0, 300.0))), 0.0025)
     with pytest.raises(ValueError, match="more than 0"):
