@@ -38,11 +38,18 @@ def figures(h: Hypotheses) -> dict[str, str]:
     }
 
 
+def unexplained(h: Hypotheses) -> str:
+    """Why an answer that is flagged `out_of_model` is: the object, or too little time to tell."""
+    if h.result in ("converged", "underway"):
+        return "out of model: no shape of the prior explains this view"
+    return f"no shape found so far explains this view: the sampler was cut short ({h.result}); give it more time"
+
+
 def warnings(h: Hypotheses) -> list[str]:
     """What makes the answer doubtful, if anything."""
     out = []
     if h.out_of_model:
-        out.append("out of model: no shape of the prior explains this view; its answers are cautious")
+        out.append(f"{unexplained(h)}; its answers are cautious")
     if (share := h.object_frame.sight_sigma) > 0.0:
         out.append(f"no depth: distance and size are known to {100 * share:.1f}% by the camera's height and tilt alone")
     if not h.inside_view:

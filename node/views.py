@@ -11,6 +11,7 @@ from jaxtyping import Float32
 from calibration.camera import Camera
 from node.message import header, image_message, make, pose, types
 from node.shade import Viewpoint, largest_along
+from node.summary import unexplained
 from perception.hypotheses import Hypotheses, binary_entropy, by_weight, meshes
 from perception.query import marginal
 from probnerf.occupancy import voxel_centres
@@ -192,7 +193,7 @@ def diagnostics_message(stamp_ns: int, statuses: Sequence[Status]) -> Any:
 
 def sampler_status(h: Hypotheses, now_ns: int) -> Status:
     """What the sampler says of one object."""
-    message = h.result if not h.out_of_model else f"{h.result}; out of model: no shape of the prior explains the view"
+    message = h.result if not h.out_of_model else f"{h.result}; {unexplained(h)}"
     age = (now_ns - h.stamp_ns) * 1e-9
     values = {"age (s)": age, "stage": h.stage, "monte carlo error": h.monte_carlo_error}
     values |= {"effective hypotheses": h.effective_hypotheses, **h.diagnostics}

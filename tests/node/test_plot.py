@@ -125,3 +125,7 @@ def test_the_short_table_tells_the_unseen(mug: Hypotheses) -> None:
     bad = {"divergences": 2.0, "r_hat": 1.3}
     assert len(warnings(replace(mug, out_of_model=True, inside_view=False, diagnostics=bad))) == 4
     assert not warnings(replace(mug, diagnostics={"r_hat": 1.05}))
+    (said,) = warnings(replace(mug, out_of_model=True))
+    assert said.startswith("out of model: no shape of the prior")
+    (said,) = warnings(replace(mug, out_of_model=True, result="budget"))  # time may be all that it lacked
+    assert "cut short (budget); give it more time" in said and "out of model" not in said
