@@ -16,13 +16,24 @@ import yaml
 T = TypeVar("T")
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML in which no key stands twice; of two the plain loader would keep the last without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
+        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise yaml.YAMLError(f"line {node.start_mark.line + 1} and below give {key} twice; leave one out")
+        return super().construct_mapping(node, deep)
+
+
 def load_config(path: Path, into: type[T]) -> T:
     """The dataclass `into` filled from a YAML file.
 
     Raises FileNotFoundError, or ValueError naming the file, the key and the remedy.
     """
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise FileNotFoundError(f"{path}: no such configuration file; see launch/replay.yaml for one") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -67,6 +67,8 @@ class ControllerConfig(PublishConfig):
         super().__post_init__()
         if min(self.first_hypotheses, self.runs) < 1:
             raise ValueError(f"first_hypotheses {self.first_hypotheses} and runs {self.runs} must be 1 or more")
+        if not (self.tolerance >= 0.0 and 0.0 <= self.unexplained <= 1.0):
+            raise ValueError(f"tolerance {self.tolerance:g} must be 0 or more, unexplained {self.unexplained:g} 0 to 1")
 
     def needed(self, done: int, loss: float, missed: float) -> int:
         """How many runs the answer takes, if `done` of them leave this expected loss and share of pixels missed."""

@@ -28,8 +28,10 @@ class PublishConfig:
     out_of_model_below: float = 0.88  # share of telling pixels explained on average; validation objects: 0.89 and more
 
     def __post_init__(self) -> None:
-        if self.hypotheses < 1 or not 1 <= self.grid <= 512:
-            raise ValueError(f"hypotheses {self.hypotheses} must be 1 or more, and grid {self.grid} from 1 to 512")
+        if self.hypotheses < 1:
+            raise ValueError(f"hypotheses is {self.hypotheses}; give 1 or more")
+        if not 1 <= self.grid <= 512:
+            raise ValueError(f"grid is {self.grid}; give 1 to 512")
 
 
 @dataclass(frozen=True, eq=False)

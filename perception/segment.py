@@ -39,6 +39,11 @@ class SegmentConfig:
     mask: MaskConfig = field(default_factory=MaskConfig)  # without depth
     guess: PlaneGuess = field(default_factory=PlaneGuess)  # without depth
 
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, float | int) and not 0 <= value < np.inf:
+                raise ValueError(f"{name} is {value:g}; give 0 or more")
+
 
 @dataclass(frozen=True, eq=False)
 class Segment:
@@ -74,7 +79,7 @@ def segment(frame: Frame, object_id: int | None = None, config: SegmentConfig | 
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
     if not np.isfinite(frame.depth).any():
-        raise ValueError(f"{where}: depth is NaN in all {frame.depth.size} pixels; check the depth sensor")
+        raise ValueError(f"{where}: no pixel of {frame.depth.size} has depth; check the depth sensor")
     points = backproject(frame)
     try:
         table, on_table = support_plane(points, frame.label, config.plane)

@@ -75,6 +75,9 @@ def test_a_files_trouble_names_the_file(tmp_path: Path) -> None:
     path.write_text("name: a\nmdoe: slow\n")
     with pytest.raises(ValueError, match=r"a\.yaml: unknown key mdoe; did you mean mode"):
         load_config(path, Outer)
+    path.write_text("name: a\ninner:\n  width: 1\n  width: 2\n")
+    with pytest.raises(ValueError, match=r"a\.yaml is not YAML \(.*give width twice; leave one out"):
+        load_config(path, Outer)
     path.write_text("")
     assert load_config(path, Inner) == Inner()
 

@@ -149,7 +149,7 @@ def test_what_cannot_be_segmented_is_named() -> None:
     noise = np.random.default_rng(0).uniform(0.3, 3.0, frame.depth.shape)
     cases = [
         (replace(frame, depth=None), None, "without depth the plane"),
-        (blank(frame, everywhere), None, "NaN in all 76800 pixels"),
+        (blank(frame, everywhere), None, "no pixel of 76800 has depth"),
         (frame, 7, "no object 7; its objects: 1"),
         (replace(frame, label=None), 7, "no object 7; its objects: 1"),
         (few, 1, "object 1 has 20 pixels"),
@@ -181,3 +181,9 @@ def test_the_real_frame(shared_data: Path) -> None:
         assert np.abs(best.plane - known.plane).max() < 0.003
     can, _, meat, pitcher = (s.plane[3] for s in given)
     assert can == pitcher and 0.03 < can - meat < 0.045  # the meat can stands on the sugar box
+
+
+@pytest.mark.parametrize("change", [{"above": -1.0}, {"voxel": float("nan")}, {"min_pixels": -1}])
+def test_a_length_that_is_none_is_named(change: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(change))} is .*; give 0 or more"):
+        SegmentConfig(**change)
