@@ -258,7 +258,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, FloatingPointError) as error:
         if "--debug" in given:
             raise
-        print(f"farside: error: {' '.join(str(error).split())}", file=sys.stderr)
+        said = str(error)
+        if isinstance(error, OSError) and error.filename is not None and said.startswith("[Errno"):
+            said = f"{error.filename}: {error.strerror}; check this path, and that it may be read or written"
+        print(f"farside: error: {' '.join(said.split())}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as error:
         if "--debug" in given:

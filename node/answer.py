@@ -12,6 +12,7 @@ from perception.region import Region
 from perception.verdict import verdict
 
 CM3 = 1e6  # per cubic metre
+SHOWN = 100  # points, each on a line
 
 
 def answer(
@@ -33,8 +34,11 @@ def answer(
     for object_id, blocking in result.blocked_by.items():
         table.add_row(f"not free in, object {object_id}", _numbers(blocking))
     out.print(table, highlight=False)
-    for i, p in enumerate(result.p_occupied or [], start=1):
+    points = result.p_occupied or []
+    for i, p in enumerate(points[:SHOWN], start=1):
         out.print(f"  point {i}: occupied with probability {p:.3f}", highlight=False)
+    if len(points) > SHOWN:
+        out.print(f"  and {len(points) - SHOWN} more points, which --json lists", highlight=False)
 
 
 def rows(r: QueryResult) -> list[tuple[str, str]]:

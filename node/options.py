@@ -123,11 +123,12 @@ class Query:
         tuple[float, float, float, float, float, float] | None,
         arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint="(this, --points or --mesh)"),
     ] = None
-    """Two opposite corners of an axis-aligned box, metres."""
+    """The lower and the upper corner of an axis-aligned box, metres."""
     points: Annotated[Path | None, arg(metavar="FILE.xyz", help_behavior_hint="(this, --box or --mesh)")] = None
     """Text file of points, one a line: x y z in metres."""
     mesh: Annotated[Path | None, arg(metavar="FILE.obj", help_behavior_hint="(this, --box or --points)")] = None
-    """Mesh (.obj, .stl, .ply, .off, .glb) in metres, in the frame of the question: what it fills."""
+    """Mesh (.obj, .stl, .ply, .off, .glb) in metres, in the frame of the question: what it fills (with openings: its
+    surface alone)."""
     frame: Literal["object", "camera", "world"] = "object"
     """Frame of the question. object: z up, x to the camera, the plane under the origin; camera: x right, y down."""
     risk: float = 0.05

@@ -89,7 +89,11 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
     frame = read_frame(config.source, config.frame, err, config.start_s, config.end_s, camera)
     if config.colour_only:
         frame = replace(frame, depth=None)
-    segments = segment(frame, config.object, _segmentation(frame, config))
+    segmentation, source = _segmentation(frame, config), config.source or SHIPPED_LOG
+    try:
+        segments = segment(frame, config.object, segmentation)
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
     limit = config.budget or (None if config.stages else BUDGET_S)
     kept, done = frame_path(config.folder), list[Hypotheses]()
     is_source = config.source is not None and config.source.resolve() == kept.resolve()
@@ -102,10 +106,9 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
             budget = None if share is None else max(share, 1.0)
             result = infer(frame, found, prior, config.inference, err, config.seed, config.stages, budget)
         except ValueError as error:
-            if len(segments) == 1:
-                raise
-            err.print(f"object {found.id} is left out: {error}", highlight=False, soft_wrap=True)
-            complaint = error
+            if len(segments) > 1:
+                err.print(f"object {found.id} is left out: {error}", highlight=False, soft_wrap=True)
+            complaint = ValueError(f"{source}: {error}")
             continue
         if not done and not is_source:
             (kept / "meta.json").unlink(missing_ok=True)  # an earlier run's frame is not read beside this one's objects

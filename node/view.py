@@ -44,6 +44,8 @@ def draw(path: Path, picture: Path, out: Console, err: Console) -> None:
         raise ValueError(f"{path} holds {len(scene)} objects; give one file, or a folder for --out, not {picture}")
     if not several and picture.is_dir():
         raise ValueError(f"{picture} is a folder; give a file for --out, such as {picture / 'object.png'}")
+    if not several and picture.suffix.lower() != ".png":
+        raise ValueError(f"{picture} is no name for a PNG; give a file for --out such as {picture.with_suffix('.png')}")
     view = load_view(path, scene, err)
     for h in scene:
         target = picture / f"object_{h.object_id}.png" if several else picture

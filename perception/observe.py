@@ -204,7 +204,8 @@ def object_frame(frame: Frame, segment: Segment, config: ObserveConfig) -> Objec
     core = (segment.status[box] == OBJECT) & np.isfinite(points[..., 2])
     if core.sum() < 10:
         raise ValueError(
-            f"object {segment.id} has depth in {core.sum()} pixels inside its outline; move the camera nearer"
+            f"object {segment.id} has depth in {core.sum()} pixels inside its outline; move the camera "
+            "nearer, and see that depth is aligned to colour"
         )
     # The rim counts here, where its depth continues the object's: it is wide on surfaces seen at a grazing angle.
     row, column = ndimage.distance_transform_edt(~core, return_distances=False, return_indices=True)

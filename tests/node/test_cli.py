@@ -183,7 +183,7 @@ def _spoil(folder: Path, what: str, frame: Frame) -> None:
     [
         ("truncated colour", r"color\.png is cut short at byte 500; copy it again"),
         ("other size", r"depth\.png is 120x90 px but color\.png is 240x180; align"),
-        ("no depth", r"depth is NaN in all 43200 pixels; check the depth sensor"),
+        ("no depth", r"no pixel of 43200 has depth; check the depth sensor"),
         ("tiny mask", r"object 1 has 9 pixels, .* at least 50 are needed: move the camera nearer"),
         ("too large", r"object 1 measures .* cm across and .* tabletop objects are .*: give another object"),
         ("no matrix", r"meta\.json has no camera_matrix_px; add it"),
@@ -214,6 +214,7 @@ def test_a_bad_frame_folder_is_named(
         (["replay", "{table}", "--budget", "0"], "the budget is 0 s; give more than 0"),
         (["replay", "{table}", "--stages", "0"], "stages is 0; give 1 or more"),
         (["replay", "{table}", "--out", "{text}"], "notes.txt is a file; give a folder"),
+        (["replay", "{table}", "--out", "{text}/below"], "check this path, and that it may be read or written"),
         (["replay", "{table}", "--prior", "{text}"], "notes.txt is not a readable prior"),
         (["replay", "{table}", "--prior", "{other}"], "needs ["),
         (["replay", "{table}", "--prior", "none.safetensors"], "none.safetensors: no such prior"),
@@ -342,4 +343,8 @@ def test_query_answers_in_json_and_in_words(tmp_path: Path, frame: Frame, capsys
     assert main(["query", str(path), "--points", str(points), "--frame", "camera"]) == 0
     said = capsys.readouterr().out
     assert "verdict at a risk of 0.05" in said and "all of it is free" in said
-    assert "point 2: occupied with probability" in said
+    assert "point 2: occupied with probability" in said and "more points" not in said
+    points.write_text("0 0 0\n" * 3000)
+    assert main(["query", str(path), "--points", str(points)]) == 0
+    said = capsys.readouterr().out
+    assert "and 2900 more points, which --json lists" in said and "point 100:" in said and "point 101:" not in said

@@ -85,6 +85,8 @@ def test_out_draws_a_picture_and_opens_no_page(
     (results / "frame" / "meta.json").unlink()
     assert main(["view", str(results / "object_1.npz"), "--out", str(one)]) == 0
     assert (cv2.imread(str(one)) != with_view).any(axis=2).mean() > 0.01  # the camera's view is part of the picture
+    assert main(["view", str(results / "object_1.npz"), "--out", str(tmp_path / "a.jpg")]) == 1
+    assert f"a.jpg is no name for a PNG; give a file for --out such as {one}" in capsys.readouterr().err
     assert main(["view", str(results), "--out", str(one)]) == 1
     assert f"holds 2 objects; give one file, or a folder for --out, not {one}" in capsys.readouterr().err
     monkeypatch.setattr("node.view.draw_object", lambda path, *_: path.parent.mkdir(exist_ok=True) or path.touch())
