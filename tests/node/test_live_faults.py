@@ -132,8 +132,8 @@ def test_ctrl_c_while_it_compiles_ends_with_its_code(how: signal.Signals, tmp_pa
 @pytest.mark.parametrize(
     ("key", "says"),
     [
-        ("controller: {hypotheses: 0}", "hypotheses 0 must be"),
-        ("controller: {grid: 0}", "grid 0 from 1 to 512"),
+        ("controller: {hypotheses: 0}", "hypotheses is 0; give 1"),
+        ("controller: {grid: 0}", "grid is 0; give 1 to 512"),
         ("controller: {infer: {lattice: 0}}", "lattice 0 must be 1 or more"),
         ("controller: {infer: {wall_sigma: 0}}", "wall_sigma 0 and"),
         ("track: {views: 0}", "views 0 and checked 32"),
