@@ -3,9 +3,9 @@
 The same views throughout: objects of the test seeds as they come, from a random camera (`farside bench calibration`).
 Sensor and calibration are spoilt by growing amounts, or the model is given too little, and everything else is left as
 it ships. At every amount: hidden_nll of what is truly unseen, over the views that were answered; flagged: share of
-answers that say `out_of_model`, or that perception refuses in words; falsely_free: of random unseen boxes given
-p_free > 0.95, the share that is occupied. An exception other than a refusal, or a number that is none, counts as
-broken: there must be none.
+answers that say `out_of_model`, or that perception refuses in words; called_free: how many random unseen boxes are
+given p_free > 0.95; falsely_free: the share of those that is occupied. An exception other than a refusal, or a number
+that is none, counts as broken: there must be none.
 
 Answers are appended to a file as they come, and what is there is not made again.
 """
@@ -207,6 +207,7 @@ def _rows(axes: Sequence[Axis], found: dict[str, list[list[Seen]]], n: int) -> l
                 "hidden_nll_above_shipped_q975": gap.high,
                 "flagged": float(np.mean([s.flagged for s in seen])),
                 "falsely_free": _falsely_free(seen),
+                "called_free": float(sum(p > 0.95 for s in seen for p in s.p_free)),
                 "broken": float(np.mean([bool(s.broken) for s in seen])),
             }
             if len(seen) > n:

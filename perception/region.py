@@ -100,7 +100,7 @@ def read_mesh(path: Path, width: float) -> Cells:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; give a mesh (.obj, .stl, .ply, .off or .glb, in metres)")
     try:
-        mesh = trimesh.load_mesh(path, process=False)  # which would drop vertices that are not finite, and their faces
+        mesh = trimesh.load_mesh(path, process=False)  # processing drops vertices that are not finite
     except Exception as error:  # whatever a reader of one of its formats meets
         raise ValueError(f"{path} cannot be read as a mesh ({error}); export it again as .obj, .stl or .ply") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):

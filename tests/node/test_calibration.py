@@ -247,13 +247,16 @@ def test_replay_takes_a_calibration(
 
     monkeypatch.setattr(node.pipeline, "segment", reached)
     for name, says in (
-        ("right.yaml", ": reached"),
+        ("right.yaml", "shipped.mcap: reached"),
         ("small.yaml", "the camera is calibrated at 64x48 px but colour is 640x480"),
     ):
         assert main(["replay", "--camera", str(tmp_path / name), "--out", str(tmp_path / "out")]) == 1
         assert says in capsys.readouterr().err
     bare = record(tmp_path / "bare", "mcap", [maker("mcap").image("/cam/image", 1, frame.rgb, "rgb8")])
-    for given, says in ((["--camera", str(tmp_path / "right.yaml")], ": reached"), ([], "or give a camera file")):
+    for given, says in (
+        (["--camera", str(tmp_path / "right.yaml")], f"error: {bare}: reached"),
+        ([], "or give a camera file"),
+    ):
         assert main(["replay", str(bare), *given, "--out", str(tmp_path / "out")]) == 1
         assert says in capsys.readouterr().err
     assert main(["replay", "--camera", str(tmp_path / "absent.yaml"), "--out", str(tmp_path / "out")]) == 1
