@@ -174,6 +174,8 @@ def infer_view(
             answered, missed = len(runs), 1.0 - h.diagnostics["explained"]
             loss = h.diagnostics["expected_loss"]
             told = f"expected loss {loss:.4f} nats, {100 * missed:.0f}% of pixels not explained"
+            if failed := int(h.diagnostics["failed_populations"]):
+                told += f", {failed} populations far from the best left out"
             log.append(f"{work.amount(answered)}: {told}")
             if grows and short is None:
                 needed = config.needed(answered, loss, missed)

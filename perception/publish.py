@@ -98,6 +98,7 @@ def published(
             "log_evidence": float(posterior.log_evidence),
             "log_evidence_se": float(posterior.log_evidence_se),
             "explained": fit,
+            "failed_populations": float(len(np.unique(posterior.population)) - len(np.unique(population))),
             "power": likelihood.power,
             **diagnostics,
         },

@@ -227,9 +227,10 @@ def tempered_smc(
 
     The samples are the pools of the last `keep` stages. A population's share of the weight is its evidence estimate, so
     that weighted averages stay consistent when populations found different modes; with few particles, whose estimates
-    err by nats, a smaller `evidence_power` keeps a lucky one from silencing the others. log_evidence is the logarithm
-    of the mean estimate; its error is the larger of two, one from the populations' spread (which is chance with only
-    two) and one from the weights' variance stage by stage (which knows nothing of a mode that all particles missed).
+    err by nats, a smaller `evidence_power` keeps a lucky one from silencing the others; one that failed has no share
+    even so (`populations.FAILED`). log_evidence is the logarithm of the mean estimate; its error is the larger of two,
+    one from the populations' spread (which is chance with only two) and one from the weights' variance stage by stage
+    (which knows nothing of a mode that all particles missed).
 
     After each stage `on_stage` is told of it, may ask for the samples so far, and ends the run by answering True.
 

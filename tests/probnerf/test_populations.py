@@ -1,12 +1,14 @@
 """Populations side by side: shares by evidence, runs that are pooled, samples as starts in fewer populations."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from probnerf.infer import InferConfig, quick_smc, sampler_of
-from probnerf.populations import log_prior, pooled, shares, start_from, thin
+from probnerf.populations import FAILED, log_prior, pooled, shares, start_from, thin
 from probnerf.smc import TemperedSMCConfig, tempered_smc
 from probnerf.types import Posterior
 
@@ -30,6 +32,32 @@ def test_shares_follow_the_evidence_to_a_power() -> None:
     np.testing.assert_allclose(np.exp(shares(estimates[:2], 0.0)[0]), [0.5, 0.5])
     for missing in (np.array([0.0, np.nan]), np.full(2, -np.inf)):
         np.testing.assert_allclose(np.exp(shares(missing, 1.0)[0]), [0.5, 0.5])
+
+
+def test_a_population_far_below_the_best_has_no_share_and_a_few_nats_change_nothing() -> None:
+    estimates = np.array([-1000.0, -1000.0 - 2.0 * FAILED, -1004.0, -np.inf])
+    np.testing.assert_allclose(np.exp(shares(estimates, 0.0)[0]), [0.5, 0.0, 0.5, 0.0])
+    whole, mean = shares(estimates, 1.0)  # which it had none of anyway
+    np.testing.assert_allclose(np.exp(whole), np.exp(estimates - mean) / 4.0, atol=1e-12)
+    even = shares(np.array([0.0, -0.9 * FAILED]), 0.0)[0]
+    np.testing.assert_allclose(np.exp(even), [0.5, 0.5])
+
+
+def test_a_failed_population_is_neither_weighed_nor_published_nor_a_disagreement() -> None:
+    good, poor = _run(0), _run(1)
+    lost = np.array([0.0, 2.0 * FAILED], np.float32)  # its second population is in another, poorer mode
+    poor = replace(
+        poor,
+        log_likelihoods=poor.log_likelihoods - lost[np.asarray(poor.population)],
+        diagnostics=replace(poor.diagnostics, log_evidences=poor.diagnostics.log_evidences - lost),
+    )
+    whole = pooled([good, poor], 0.0)
+    total = np.bincount(np.asarray(whole.population), weights=np.exp(np.asarray(whole.log_weights, np.float64)))
+    np.testing.assert_allclose(total, [1 / 3, 1 / 3, 1 / 3, 0.0], atol=1e-6)
+    assert float(whole.diagnostics.ess) == pytest.approx(0.75 * len(whole.positions), rel=1e-4)
+    assert float(whole.diagnostics.r_hat) < 1.1
+    _, weights, population = thin(whole, 12)
+    assert np.bincount(population).tolist() == [4, 4, 4] and weights == pytest.approx(np.full(12, 1 / 12))
 
 
 def test_pooled_runs_are_the_posterior_with_the_known_mean_and_evidence() -> None:
