@@ -125,6 +125,10 @@ def test_the_short_table_tells_the_unseen(mug: Hypotheses) -> None:
     bad = {"divergences": 2.0, "r_hat": 1.3}
     assert len(warnings(replace(mug, out_of_model=True, inside_view=False, diagnostics=bad))) == 4
     assert not warnings(replace(mug, diagnostics={"r_hat": 1.05}))
+    lost = {"failed_populations": 3.0}
+    (said,) = warnings(replace(mug, population=np.zeros_like(mug.population), diagnostics=lost))
+    assert "all but one" in said
+    assert not warnings(replace(mug, population=np.arange(len(mug.weights)) % 2, diagnostics=lost))
     (said,) = warnings(replace(mug, out_of_model=True))
     assert said.startswith("out of model: no shape of the prior")
     (said,) = warnings(replace(mug, out_of_model=True, result="budget"))  # time may be all that it lacked
