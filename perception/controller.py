@@ -173,7 +173,8 @@ def infer_view(
             h = work.answer = work.publish(pooled(runs, work.smc.evidence_power), config.hypotheses)
             answered, missed = len(runs), 1.0 - h.diagnostics["explained"]
             loss = h.diagnostics["expected_loss"]
-            told = f"expected loss {loss:.4f} nats, {100 * missed:.0f}% of pixels not explained"
+            told = f"expected loss {loss:.4f} nats" if np.isfinite(loss) else "expected loss not known"
+            told += f", {100 * missed:.0f}% of pixels not explained"
             if failed := int(h.diagnostics["failed_populations"]):
                 told += f", {failed} populations far from the best left out"
             log.append(f"{work.amount(answered)}: {told}")
