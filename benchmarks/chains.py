@@ -56,7 +56,11 @@ def unexplained(question: Question, sampled: Sampled) -> Float[np.ndarray, "chai
     share = explained(question.prior.model, without_sizes(sampled.likelihood), sampled.observation, posterior.positions)
     missed, weights = 1.0 - np.asarray(share, np.float64), np.exp(np.asarray(posterior.log_weights, np.float64))
     chain = np.asarray(posterior.population)
-    return np.array([np.average(missed[chain == c], weights=weights[chain == c]) for c in np.unique(chain)])
+    found = []
+    for c in np.unique(chain):
+        own = weights[chain == c]
+        found.append(np.average(missed[chain == c], weights=own if own.sum() > 0.0 else None))  # a failed one has none
+    return np.array(found)
 
 
 def relative_spread(volumes: Float[np.ndarray, "s"], weights: Float[np.ndarray, "s"]) -> float:

@@ -56,8 +56,12 @@ def warnings(h: Hypotheses) -> list[str]:
         out.append("the picture's border cuts the object off")
     if (r_hat := h.diagnostics.get("r_hat", np.nan)) > R_HAT:
         out.append(f"the sampler's populations disagree (R-hat {r_hat:.2f}): other shapes may fit too")
-    if h.diagnostics.get("failed_populations", 0.0) > 0 and len(np.unique(h.population)) == 1:
-        out.append("all but one of the sampler's populations failed: how far off the answer may be is not known")
+    left = len(np.unique(h.population))
+    if h.failed >= left:
+        unknown = ": how far off it may be is not known" if h.alone else ""
+        out.append(
+            f"the answer rests on {left} of the sampler's {h.failed + left} populations; the others failed{unknown}"
+        )
     if h.diagnostics.get("divergences", 0.0) > 0:
         out.append(f"{h.diagnostics['divergences']:.0f} divergent trajectories")
     return out

@@ -74,7 +74,7 @@ class ControllerConfig(PublishConfig):
         """How many runs the answer takes, if `done` of them leave this expected loss and share of pixels missed."""
         if missed > self.unexplained:
             return self.runs
-        if loss <= self.tolerance:
+        if loss <= self.tolerance or np.isposinf(self.tolerance):  # whatever it loses, known or not
             return done
         wanted = done * loss / self.tolerance if self.tolerance > 0 and np.isfinite(loss) else np.inf
         return int(min(self.runs, max(done + 1, np.ceil(min(wanted, self.runs)))))
@@ -176,7 +176,7 @@ def infer_view(
             told = f"expected loss {loss:.4f} nats" if np.isfinite(loss) else "expected loss not known"
             told += f", {100 * missed:.0f}% of pixels not explained"
             if failed := int(h.diagnostics["failed_populations"]):
-                told += f", {failed} populations far from the best left out"
+                told += f", populations that failed and are left out: {failed}"
             log.append(f"{work.amount(answered)}: {told}")
             if grows and short is None:
                 needed = config.needed(answered, loss, missed)

@@ -120,6 +120,16 @@ class Hypotheses:
         """Effective sample size of the weights, identical hypotheses merged: 1 / sum_g W_g^2."""
         return float(1.0 / (self.weights @ self._twin_weight))
 
+    @property
+    def failed(self) -> int:
+        """How many of the sampler's populations never left a poor mode, and are left out."""
+        return int(self.diagnostics.get("failed_populations", 0.0))
+
+    @property
+    def alone(self) -> bool:
+        """All but one of the sampler's populations failed, so that nothing tells how far off that one is."""
+        return self.failed > 0 and len(np.unique(self.population)) == 1
+
     def estimate(
         self, values: Shaped[np.ndarray, "S ..."]
     ) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:

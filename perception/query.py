@@ -77,7 +77,7 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
         touched.append(h)
         p_free.append(float(free))
         p_free_se.append(float(se))
-        n = h.effective_hypotheses
+        n = 1.0 if h.alone else h.effective_hypotheses  # one population is one witness
         p_free_few.append((n * float(free) + 1.0) / (n + 2.0))
         volumes.append((filled, weights))
         entropies.append(binary_entropy(marginal(h)[index]))

@@ -112,7 +112,7 @@ class Diagnostics(eqx.Module):
 
     acceptance: Float[Array, ""]  # mean Metropolis acceptance over the last stage
     divergences: Int[Array, ""]  # trajectories whose energy error exceeded 1,000 nats or was not finite
-    r_hat: Float[Array, ""]  # split R-hat of the log-likelihood over chains or populations (NaN where undefined)
+    r_hat: Float[Array, ""]  # split R-hat of the log-likelihood over chains or weighed populations (NaN: undefined)
     ess: Float[Array, ""]  # effective sample size of the final weights
     ancestors: Int[Array, ""]  # distinct initial particles that survive
     stages: Int[Array, ""]

@@ -24,13 +24,15 @@ def test_spread_is_the_weighted_deviation_over_the_mean() -> None:
 
 def test_a_chain_counts_by_its_own_samples_and_their_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(chains, "without_sizes", lambda likelihood: likelihood)
-    monkeypatch.setattr(chains, "explained", lambda *_: jnp.array([1.0, 0.5, 0.8, 0.9]))
+    monkeypatch.setattr(chains, "explained", lambda *_: jnp.array([1.0, 0.5, 0.8, 0.9, 0.5, 0.7]))
     posterior = SimpleNamespace(
-        positions=None, log_weights=jnp.log(jnp.array([0.3, 0.1, 0.6, 1e-9])), population=jnp.array([0, 0, 2, 2])
+        positions=None,
+        log_weights=jnp.log(jnp.array([0.3, 0.1, 0.6, 1e-9, 0.0, 0.0])),
+        population=jnp.array([0, 0, 2, 2, 3, 3]),  # the last one failed
     )
     sampled = SimpleNamespace(posterior=posterior, likelihood=None, observation=None)
     question = SimpleNamespace(prior=SimpleNamespace(model=None))
-    np.testing.assert_allclose(unexplained(question, sampled), [0.125, 0.2], atol=1e-6)
+    np.testing.assert_allclose(unexplained(question, sampled), [0.125, 0.2, 0.4], atol=1e-6)
 
 
 def test_the_file_is_summed_up(tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def test_a_cut_between_later_runs_keeps_all_that_are_whole() -> None:
     each = [answers_of(replace(config, runs=runs))[0].hypotheses.stage for runs in (2, 3)]
     found, _ = answers_of(config, (each[0] + each[1]) // 2)
     assert found.hypotheses.result == "stages" and found.posterior.positions.shape[0] == 40
-    assert len(np.unique(found.hypotheses.population)) == 4
+    assert len(np.unique(found.hypotheses.population)) + found.hypotheses.diagnostics["failed_populations"] == 4
     assert found.log[1].startswith("4 x 10 particles: expected loss") and found.log[2] == "no room for more (stages)"
 
 
@@ -102,6 +102,7 @@ def test_a_cut_between_later_runs_keeps_all_that_are_whole() -> None:
 )
 def test_how_many_runs_a_loss_takes(done: int, loss: float, missed: float, needed: int) -> None:
     assert ControllerConfig(tolerance=0.01, unexplained=0.1, runs=6).needed(done, loss, missed) == needed
+    assert ControllerConfig(tolerance=inf, unexplained=1.0, runs=6).needed(done, loss, missed) == done
 
 
 def test_no_runs_are_refused() -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from perception.query import QueryResult, query
@@ -47,6 +48,17 @@ def test_hypotheses_that_all_agree_leave_a_doubt_for_each_object() -> None:
     assert alone.p_free == both.p_free == 1.0
     assert alone.p_free_few == pytest.approx((n + 1) / (n + 2))
     assert both.p_free_few == pytest.approx(((n + 1) / (n + 2)) ** 2)
+
+
+def test_one_population_that_did_not_fail_is_one_witness() -> None:
+    shapes = [_fill(BODY, ((0.08 + 0.002 * k, 0.08, -0.08), (0.082 + 0.002 * k, 0.09, 0.08))) for k in range(30)]
+    sure = replace(_object(shapes, [1 / 30] * 30), population=np.zeros(30, np.int32))
+    lost = replace(sure, diagnostics={"failed_populations": 3.0})
+    free = Box((-0.14, -0.14, 0.1), (-0.1, -0.1, 0.14))
+    assert query([lost], free, "object").p_free_few == pytest.approx(2 / 3)
+    assert verdict(query([lost], free, "object"), 0.3) == "unsure"
+    two = replace(lost, population=np.arange(30, dtype=np.int32) % 2)
+    assert query([two], free, "object").p_free_few == query([sure], free, "object").p_free_few > 0.7
 
 
 def _in_camera(box: Box) -> Box:
