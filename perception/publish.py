@@ -25,7 +25,7 @@ class PublishConfig:
 
     hypotheses: int = 48  # shapes published
     grid: int = 64  # voxels per axis, G
-    out_of_model_below: float = 0.88  # share of telling pixels explained on average; validation objects: 0.89 and more
+    out_of_model_below: float = 0.90  # share of telling pixels explained on average; validation objects: 0.91 and more
 
     def __post_init__(self) -> None:
         if self.hypotheses < 1:
