@@ -175,8 +175,8 @@ def infer_view(
             loss = h.diagnostics["expected_loss"]
             told = f"expected loss {loss:.4f} nats" if np.isfinite(loss) else "expected loss not known"
             told += f", {100 * missed:.0f}% of pixels not explained"
-            if failed := int(h.diagnostics["failed_populations"]):
-                told += f", populations that failed and are left out: {failed}"
+            if h.failed:
+                told += f", populations that failed and are left out: {h.failed}"
             log.append(f"{work.amount(answered)}: {told}")
             if grows and short is None:
                 needed = config.needed(answered, loss, missed)
