@@ -40,7 +40,7 @@ lock: setup
 		--generate-hashes --custom-compile-command 'make lock' --quiet --output-file requirements.lock $(ARGS)
 
 clean:
-	rm -rf .venv probnerf/kernel/*.so .jax_cache .mypy_cache .pytest_cache .ruff_cache *.egg-info
+	rm -rf .venv probnerf/kernel/*.so .jax_cache .hypothesis .mypy_cache .pytest_cache .ruff_cache *.egg-info
 
 setup: .venv/.installed .venv/.kernel
 

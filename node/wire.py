@@ -4,7 +4,7 @@ import re
 import struct
 from dataclasses import dataclass
 
-from node.xxh3 import xxh3_128
+import xxhash
 
 _NAME = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 _ATTACHMENT = struct.Struct("<qqB16s")
@@ -54,8 +54,7 @@ def quality(depth: int, latched: bool = False) -> str:
 
 def gid(token: str) -> bytes:
     """The 16 bytes that stand for the entity of a token."""
-    low, high = xxh3_128(token.encode())
-    return low.to_bytes(8, "little") + high.to_bytes(8, "little")
+    return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
 
 
 def attachment(sequence: int, time_ns: int, source: bytes) -> bytes:

@@ -64,6 +64,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "yaml": ("calibration/camera_info.py", "node/config.py"),  # camera files; launch files
     "zenoh": ("node/bus.py",),
     "viser": ("node/page.py",),
+    "xxhash": ("node/wire.py",),
     "tyro": ("node/__main__.py", "node/options.py", "benchmarks/*", "examples/*"),
     "trimesh": ("perception/region.py", "benchmarks/mesh.py"),
     "rich": ("node/*", "benchmarks/*"),
