@@ -5,7 +5,7 @@ z~ is a draw of the posterior given that picture, and eight chains start from it
 steps at one step size, the mean Metropolis acceptance of the last iteration. Pose known, pixel colours on white with
 Gaussian errors of 0.1, no range. Every renderer explains a picture of its own:
 
-- foam: compositing at the crossings of the lattice's faces (`probnerf.foam`)
+- foam: compositing at the crossings of the lattice's faces (`probnerf.rendering.foam`)
 - quadrature: as many even steps between the cube's ends of the ray, piecewise constant density
 - quadrature, importance samples: half of its samples where the other half saw weight (NeRF's fine pass); as there, no
   gradient runs through their places
@@ -25,11 +25,11 @@ from matplotlib.figure import Figure
 
 from benchmarks.rows import Row
 from benchmarks.summary import mean_rows, say
-from probnerf import foam
-from probnerf.families.render import look_at, pinhole_rays
-from probnerf.hmc import Target, hmc_step
-from probnerf.prior import ProbNeRF
-from probnerf.store import load_prior
+from probnerf.geometry import look_at, pinhole_rays
+from probnerf.prior.checkpoint import load_prior
+from probnerf.prior.networks import ProbNeRF
+from probnerf.rendering import foam
+from probnerf.sampling.hmc import Target, hmc_step
 from probnerf.types import Rays
 
 CUBES = 32

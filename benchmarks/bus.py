@@ -19,14 +19,14 @@ from matplotlib.figure import Figure
 
 from benchmarks.rows import Row
 from benchmarks.summary import say
-from node.bus import Bus
-from node.bus_config import BusConfig
-from node.message import QUERY_REGION, header, image_message, make
-from node.parameters import serve_parameters
-from node.serve import POINTS, Answers
-from perception.hypotheses import Hypotheses
-from perception.observe import ObjectFrame
-from probnerf.occupancy import voxel_centres
+from node.ros.bus import Bus
+from node.ros.bus_config import BusConfig
+from node.ros.messages import QUERY_REGION, header, image_message, make
+from node.ros.parameters import serve_parameters
+from node.ros.services import POINTS, Answers
+from perception.answers.hypotheses import Hypotheses
+from perception.observation.rays import ObjectFrame
+from probnerf.rendering.occupancy import voxel_centres
 
 _IMAGE = "sensor_msgs/msg/Image"
 _GET = "rcl_interfaces/srv/GetParameters"

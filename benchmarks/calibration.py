@@ -31,8 +31,8 @@ from benchmarks.scene import VesselView, base_rate
 from benchmarks.score import BOXES, Answer, random_boxes, score
 from benchmarks.summary import mean_rows, say, table
 from benchmarks.unseen import ANY, SORTS, views
-from perception.controller import ControllerConfig
-from probnerf.infer import likelihood_settings
+from perception.inference.controller import ControllerConfig
+from probnerf.inference import likelihood_settings
 from probnerf.metrics import (
     ECE_BINS,
     best_of_k_iou,
@@ -45,7 +45,7 @@ from probnerf.metrics import (
     scored_voxels,
     uniform_band,
 )
-from probnerf.store import load_prior
+from probnerf.prior.checkpoint import load_prior
 
 RESULTS = Path(__file__).with_suffix(".jsonl")
 SLOW = {m.name: m for m in (VI, PAPER)}

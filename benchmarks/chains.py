@@ -29,11 +29,12 @@ from benchmarks.rows import Row
 from benchmarks.scene import GRID, vessel_view
 from benchmarks.stability import pictures
 from benchmarks.summary import interval, mean_rows, say, table
-from perception.controller import ControllerConfig
-from probnerf.infer import explained, without_sizes
+from perception.inference.controller import ControllerConfig
+from probnerf.inference import without_sizes
+from probnerf.likelihood.dispatch import log_likelihood, plain_log_likelihood
 from probnerf.metrics import paired_interval
-from probnerf.model import log_likelihood, plain_log_likelihood
-from probnerf.store import Prior, load_prior
+from probnerf.prior.checkpoint import Prior, load_prior
+from probnerf.shapes import explained
 
 RESULTS = Path(__file__).with_suffix(".jsonl")
 CONDITION = "any view"

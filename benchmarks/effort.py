@@ -30,12 +30,12 @@ from benchmarks.scene import (
 )
 from benchmarks.score import Answer, random_boxes, score
 from benchmarks.summary import interval, mean_rows, say, table
-from perception.controller import ControllerConfig, Estimate, estimate
-from perception.simulate import Placed, Scene, render
-from probnerf.families.tabletop import KINDS, TEST_SEEDS, TEXTURES
+from perception.inference.controller import ControllerConfig, Estimate, estimate
+from perception.simulation.simulated_camera import Placed, Scene, render
 from probnerf.metrics import paired_interval, scored_voxels
-from probnerf.occupancy import coarsen
-from probnerf.store import load_prior
+from probnerf.objects.tabletop import KINDS, TEST_SEEDS, TEXTURES
+from probnerf.prior.checkpoint import load_prior
+from probnerf.rendering.occupancy import coarsen
 
 EASY, HARD = CONDITIONS = ("plain can, seen well", "printed pitcher, half hidden")
 CONTROLLER, LARGEST = METHODS = ("controller", "largest model")

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from perception.controller import ControllerConfig
-from perception.source import Frame
-from probnerf.smc import TemperedSMCConfig
+from perception.inference.controller import ControllerConfig
+from perception.sources.frame import Frame
+from probnerf.sampling.tempered_smc import TemperedSMCConfig
 
 
 def intrinsics(frame: Frame, amount: float) -> Frame:

@@ -33,15 +33,16 @@ from scipy.spatial import cKDTree
 from benchmarks.rivals import warm_up
 from benchmarks.rows import Row
 from benchmarks.summary import say, table
-from perception.controller import ControllerConfig, Estimate, estimate
-from perception.hypotheses import Hypotheses, surface_points
-from perception.plane import heights
-from perception.query import query
-from perception.region import Points
-from perception.segment import Segment, segment
-from perception.source import Frame, read_frame_folder
+from perception.answers.hypotheses import Hypotheses, surface_points
+from perception.answers.query import query
+from perception.answers.regions import Points
+from perception.inference.controller import ControllerConfig, Estimate, estimate
+from perception.observation.segmentation import Segment, segment
+from perception.observation.support_plane import heights
+from perception.sources.frame import Frame
+from perception.sources.frame_folder import read_frame_folder
 from probnerf.metrics import hidden_log_score, symmetric_chamfer
-from probnerf.store import Prior, load_prior
+from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.types import BASE_Z
 
 DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "ycbv_000002"

@@ -34,11 +34,11 @@ from benchmarks.rows import Row
 from benchmarks.scene import base_rate, vessel_picture, vessel_view
 from benchmarks.score import BOXES, picture_psnr, random_boxes, score
 from benchmarks.summary import mean_rows, say, table
-from perception.controller import ControllerConfig
-from probnerf.families.tabletop import TEST_SEEDS
-from probnerf.infer import without_sizes
+from perception.inference.controller import ControllerConfig
+from probnerf.inference import without_sizes
 from probnerf.metrics import coverage, falsely_free, ks_distance, paired_interval, scored_voxels
-from probnerf.store import Prior, load_prior
+from probnerf.objects.tabletop import TEST_SEEDS
+from probnerf.prior.checkpoint import Prior, load_prior
 
 RESULTS = Path(__file__).with_suffix(".jsonl")
 UNITS = {

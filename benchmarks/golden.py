@@ -18,15 +18,17 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from perception.controller import ControllerConfig, estimate
-from perception.hypotheses import Hypotheses
-from perception.segment import segment
-from perception.shipped import CAMERA, SCENE, SENSOR
-from perception.simulate import Placed, Scene, place_camera, render, sense
-from perception.source import Frame, open_source
-from perception.store import load, save
-from perception.track import Tracker
-from probnerf.store import Prior, load_prior
+from perception.answers.hypotheses import Hypotheses
+from perception.answers.hypotheses_file import load, save
+from perception.inference.controller import ControllerConfig, estimate
+from perception.inference.tracker import Tracker
+from perception.observation.segmentation import segment
+from perception.simulation.sample_recording import CAMERA, SCENE, SENSOR
+from perception.simulation.sensor_faults import sense
+from perception.simulation.simulated_camera import Placed, Scene, place_camera, render
+from perception.sources.frame import Frame
+from perception.sources.open_source import open_source
+from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.types import BASE_Z
 
 FIRST_VALIDATION_SEED = 1_003_500  # objects of the family that no prior was trained on and no figure is scored on

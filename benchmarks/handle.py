@@ -29,13 +29,14 @@ from benchmarks.scene import GRID, base_rate
 from benchmarks.score import BOXES, random_boxes, score
 from benchmarks.summary import interval, mean_rows, say, table
 from benchmarks.unseen import BEHIND, views
-from perception.controller import ControllerConfig
-from perception.simulate import Placed
-from probnerf.infer import likelihood_settings, opacity_grids
+from perception.inference.controller import ControllerConfig
+from perception.simulation.simulated_camera import Placed
+from probnerf.fields.base import Model
+from probnerf.inference import likelihood_settings
 from probnerf.metrics import paired_interval, scored_voxels
-from probnerf.model import Model
-from probnerf.occupancy import solid
-from probnerf.store import load_prior
+from probnerf.prior.checkpoint import load_prior
+from probnerf.rendering.occupancy import solid
+from probnerf.shapes import opacity_grids
 
 RESULTS = Path(__file__).with_suffix(".jsonl")
 OWN = CONTROLLER.name

@@ -28,10 +28,10 @@ from benchmarks.rows import Row
 from benchmarks.scene import VesselView, base_rate, hidden_vessel
 from benchmarks.score import BOXES, Answer, random_boxes, score
 from benchmarks.summary import interval, mean_rows, say, table
-from perception.controller import ControllerConfig
-from probnerf.families.tabletop import TEST_SEEDS
+from perception.inference.controller import ControllerConfig
 from probnerf.metrics import coverage, falsely_free, ks_distance, paired_interval, scored_voxels
-from probnerf.store import load_prior
+from probnerf.objects.tabletop import TEST_SEEDS
+from probnerf.prior.checkpoint import load_prior
 
 CONDITION = "handle hidden, RGB-D"
 PER_OBJECT = ("hidden_nll", "hidden_nll_handle", "hidden_brier", "hidden_ece", "seconds")

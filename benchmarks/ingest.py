@@ -27,16 +27,16 @@ from matplotlib.figure import Figure
 from benchmarks.record import noisy
 from benchmarks.rows import Row
 from benchmarks.summary import say
-from perception.controller import estimate
-from perception.live import Counts, Reader
-from perception.query import query
-from perception.record import Recorder
-from perception.region import Points
-from perception.segment import segment
-from perception.source import Frame
-from perception.track import Tracker
-from perception.warm import warm_up
-from probnerf.store import load_prior
+from perception.answers.query import query
+from perception.answers.regions import Points
+from perception.inference.controller import estimate
+from perception.inference.tracker import Tracker
+from perception.inference.warm_up import warm_up
+from perception.observation.segmentation import segment
+from perception.sources.frame import Frame
+from perception.sources.reader import Counts, Reader
+from perception.sources.recorder import Recorder
+from probnerf.prior.checkpoint import load_prior
 
 FPS = 30.0
 ASK_S = 0.05  # between questions

@@ -31,17 +31,19 @@ from matplotlib.figure import Figure
 
 from benchmarks.rows import Row
 from benchmarks.summary import say
-from perception.log import Log
-from perception.observe import observe
-from perception.segment import segment
-from perception.source import SHIPPED_LOG
-from probnerf import fused
-from probnerf.field import MLPField, encoded_size
-from probnerf.foam import FAR
-from probnerf.infer import InferConfig, likelihood_of, with_sizes
-from probnerf.model import faces_of_view, log_likelihood, plain_log_likelihood
-from probnerf.prior import PRESETS, ProbNeRF
-from probnerf.store import load_prior
+from perception.observation.rays import observe
+from perception.observation.segmentation import segment
+from perception.sources.open_source import SHIPPED_LOG
+from perception.sources.recording import Log
+from probnerf.fields.mlp import MLPField, encoded_size
+from probnerf.inference import InferConfig, likelihood_of, with_sizes
+from probnerf.kernel import library
+from probnerf.likelihood import kernel_call
+from probnerf.likelihood.dispatch import log_likelihood, plain_log_likelihood
+from probnerf.likelihood.pixel_terms import faces_of_view
+from probnerf.prior.checkpoint import load_prior
+from probnerf.prior.networks import PRESETS, ProbNeRF
+from probnerf.rendering.foam import FAR
 from probnerf.types import OBJECT, Observation, joined
 
 
@@ -84,7 +86,7 @@ def main(out: Path, quick: bool = False, repeats: int = 9) -> list[Row]:
     """
     if repeats < 1:
         raise ValueError(f"repeats is {repeats}; give 1 or more")
-    if not fused.available():
+    if not library.available():
         raise ValueError("the kernel is not built: install a C++ compiler, then `make setup`")
     repeats = min(repeats, 3) if quick else repeats
     frame = next(iter(Log(SHIPPED_LOG)))
@@ -159,7 +161,7 @@ def _measure(condition: str, model: Prior, observation: Observation, particles: 
     matrix = jnp.ones((SIDE, SIDE), jnp.float32)
 
     def kernel(threads: int | None = None, isa: str = "") -> Callable:
-        return jax.jit(lambda w: fused.call(field, likelihood, observation, t, w, pose, threads=threads, isa=isa))
+        return jax.jit(lambda w: kernel_call.call(field, likelihood, observation, t, w, pose, threads=threads, isa=isa))
 
     runs: dict[str, tuple[Callable, Array]] = {
         "matrix product": (_squared, matrix),

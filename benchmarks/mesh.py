@@ -14,12 +14,13 @@ from scipy import ndimage
 
 from benchmarks.scene import FINE, GRID, VesselView, ViewConfig, in_table, simulated_camera, stand
 from calibration.camera import Camera
-from perception.observe import ObserveConfig, object_frame
-from perception.seen import seen_voxels
-from perception.segment import segment
-from perception.simulate import Picture, Scene, render, sense
-from perception.source import Frame
-from probnerf.occupancy import coarsen
+from perception.observation.rays import ObserveConfig, object_frame
+from perception.observation.segmentation import segment
+from perception.observation.visibility import seen_voxels
+from perception.simulation.sensor_faults import sense
+from perception.simulation.simulated_camera import Picture, Scene, render
+from perception.sources.frame import Frame
+from probnerf.rendering.occupancy import coarsen
 
 _SUB = 3  # fine pixels a side of each pixel; odd, so that one is in the middle
 _DENSITY = 8.0  # points a fine pixel of surface: one in 3000 is left open

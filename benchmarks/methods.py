@@ -22,18 +22,21 @@ from benchmarks.results import Line, digest
 from benchmarks.rivals import RivalConfig, encoder_alone, encoder_picture
 from benchmarks.scene import VesselView
 from benchmarks.score import Answer, shapes_at
-from perception.controller import ControllerConfig, estimate
-from perception.observe import ObjectFrame, observe
-from perception.seen import answered_voxels
-from probnerf.annealed import AnnealedHMCConfig
-from probnerf.baselines.map import map_estimate
-from probnerf.baselines.vi import VIConfig, mean_field
-from probnerf.infer import crossings_of, infer, likelihood_of, scaled_about
-from probnerf.model import Likelihood, faces_of_view, log_likelihood
-from probnerf.modes import log_posterior
-from probnerf.populations import thin
-from probnerf.proposal import Picture, guesses
-from probnerf.store import Prior
+from perception.inference.controller import ControllerConfig, estimate
+from perception.observation.rays import ObjectFrame, observe
+from perception.observation.visibility import answered_voxels
+from probnerf.inference import crossings_of, infer, likelihood_of
+from probnerf.likelihood.dispatch import log_likelihood
+from probnerf.likelihood.pixel_terms import faces_of_view
+from probnerf.likelihood.settings import Likelihood
+from probnerf.prior.checkpoint import Prior
+from probnerf.prior.posterior_network import Picture, guesses
+from probnerf.sampling.annealed_hmc import AnnealedHMCConfig
+from probnerf.sampling.map_estimate import map_estimate
+from probnerf.sampling.mean_field import VIConfig, mean_field
+from probnerf.sampling.modes import log_posterior
+from probnerf.sampling.populations import thin
+from probnerf.shapes import scaled_about
 from probnerf.types import Diagnostics, Observation, Posterior
 
 DEPTHS = ("RGB-D", "colour only")

@@ -2,7 +2,7 @@
 
 Objects of the test seeds from one random view each, as `farside bench calibration` takes them; the camera's place is
 known. After the first answer a second picture is taken from one of 36 places around the object at the same distance
-(`perception.next_view.ring_of_views`):
+(`perception.answers.next_view.ring_of_views`):
 
 - suggested: the place of the largest expected information gain
 - random: any of them
@@ -25,16 +25,17 @@ from benchmarks.rows import Row
 from benchmarks.scene import GRID, VesselPicture, VesselView, base_rate, vessel_view
 from benchmarks.summary import mean_rows, say, table
 from benchmarks.unseen import any_view
-from perception.controller import ControllerConfig
-from perception.hypotheses import Hypotheses
-from perception.next_view import rank_views, ring_of_views
-from perception.segment import segment
-from perception.simulate import Scene, render, sense
-from perception.track import Tracker
-from probnerf.families.tabletop import TEST_SEEDS
+from perception.answers.hypotheses import Hypotheses
+from perception.answers.next_view import rank_views, ring_of_views
+from perception.inference.controller import ControllerConfig
+from perception.inference.tracker import Tracker
+from perception.observation.segmentation import segment
+from perception.simulation.sensor_faults import sense
+from perception.simulation.simulated_camera import Scene, render
 from probnerf.metrics import hidden_nll, paired_interval, scored_voxels
-from probnerf.occupancy import coarsen, voxel_centres
-from probnerf.store import load_prior
+from probnerf.objects.tabletop import TEST_SEEDS
+from probnerf.prior.checkpoint import load_prior
+from probnerf.rendering.occupancy import coarsen, voxel_centres
 
 RESULTS = Path(__file__).with_suffix(".jsonl")
 FIRST = 8000  # among the test seeds: objects of no other measurement

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.scene import VesselPicture, ViewConfig, place, simulated_camera
-from perception.simulate import Placed, Scene, render
-from probnerf.families.tabletop import KINDS
+from perception.simulation.simulated_camera import Placed, Scene, render
+from probnerf.objects.tabletop import KINDS
 
 HIDDEN = (0.35, 0.65)  # share of the object's pixels that the carton hides
 

@@ -36,12 +36,12 @@ from benchmarks.scene import GRID, VesselView, base_rate, vessel_view
 from benchmarks.score import BOXES, Answer, as_queried, random_boxes, score
 from benchmarks.summary import mean_rows, say, table
 from benchmarks.unseen import any_view
-from perception.controller import ControllerConfig, estimate
-from perception.source import Frame
-from probnerf.families.tabletop import TEST_SEEDS
+from perception.inference.controller import ControllerConfig, estimate
+from perception.sources.frame import Frame
 from probnerf.metrics import falsely_free, scored_voxels
-from probnerf.occupancy import coarsen
-from probnerf.store import Prior, load_prior
+from probnerf.objects.tabletop import TEST_SEEDS
+from probnerf.prior.checkpoint import Prior, load_prior
+from probnerf.rendering.occupancy import coarsen
 from probnerf.types import UNKNOWN
 
 RESULTS = Path(__file__).with_suffix(".jsonl")

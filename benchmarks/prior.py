@@ -28,19 +28,21 @@ from scipy import ndimage
 
 from benchmarks.rows import Row
 from benchmarks.summary import interval, mean_rows, say, table
-from probnerf import foam
-from probnerf.ascent import AdamConfig, ascend
-from probnerf.families.draw import KINDS, TEXTURES
-from probnerf.families.render import handle_occupancy, look_at, pinhole_rays, solid_occupancy, trace
-from probnerf.families.tabletop import TEST_SEEDS, TabletopObject, sample_object
-from probnerf.infer import opacity_grids
+from probnerf.geometry import look_at, pinhole_rays
+from probnerf.likelihood.dispatch import log_likelihood
+from probnerf.likelihood.settings import Likelihood
 from probnerf.metrics import iou, psnr, recall
-from probnerf.model import Likelihood, log_likelihood
-from probnerf.occupancy import coarsen, solid
-from probnerf.prior import ProbNeRF
-from probnerf.store import load_prior
+from probnerf.objects.ray_tracer import handle_occupancy, solid_occupancy, trace
+from probnerf.objects.tabletop import TEST_SEEDS, TabletopObject, sample_object
+from probnerf.objects.tabletop_sampler import KINDS, TEXTURES
+from probnerf.prior.checkpoint import load_prior
+from probnerf.prior.encoder_input import ENCODER_RADIUS, camera_features, encoder_image
+from probnerf.prior.networks import ProbNeRF
+from probnerf.rendering import foam
+from probnerf.rendering.occupancy import coarsen, solid
+from probnerf.sampling.ascent import AdamConfig, ascend
+from probnerf.shapes import opacity_grids
 from probnerf.types import FREE, OBJECT, Observation, Rays
-from probnerf.views import ENCODER_RADIUS, camera_features, encoder_image
 
 VIEWS = 4  # given; as many held out
 GRID = 64

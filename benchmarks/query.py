@@ -29,13 +29,13 @@ from benchmarks.scene import GRID, VesselView, base_rate
 from benchmarks.score import random_boxes
 from benchmarks.summary import mean_rows, say, table
 from benchmarks.unseen import ANY, views
-from perception.controller import estimate
-from perception.hypotheses import Hypotheses
-from perception.query import marginal, query
-from perception.region import Box, Points, Swept
+from perception.answers.hypotheses import Hypotheses
+from perception.answers.query import marginal, query
+from perception.answers.regions import Box, Points, Swept
+from perception.inference.controller import estimate
 from probnerf.metrics import paired_interval, scored_voxels
-from probnerf.occupancy import coarsen
-from probnerf.store import load_prior
+from probnerf.prior.checkpoint import load_prior
+from probnerf.rendering.occupancy import coarsen
 
 JOINT, INDEPENDENT, ALONE = WAYS = ("joint", "independent voxels", "each voxel alone")
 COLOURS = dict(zip(WAYS, ("tab:blue", "tab:orange", "tab:red"), strict=True))

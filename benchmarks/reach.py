@@ -29,12 +29,12 @@ from benchmarks.scene import GRID, VesselView
 from benchmarks.summary import say, table
 from benchmarks.unseen import ANY, views
 from examples.reach import Gripper, Reach, choose, reaches
-from perception.controller import estimate
-from perception.hypotheses import Hypotheses
-from perception.query import CAUTION
-from perception.region import Swept
-from probnerf.occupancy import coarsen, voxel_centres
-from probnerf.store import load_prior
+from perception.answers.hypotheses import Hypotheses
+from perception.answers.query import CAUTION
+from perception.answers.regions import Swept
+from perception.inference.controller import estimate
+from probnerf.prior.checkpoint import load_prior
+from probnerf.rendering.occupancy import coarsen, voxel_centres
 from probnerf.types import BASE_Z
 
 FARSIDE, INDEPENDENT, FREE, OCCUPIED = BELIEFS = (

@@ -20,8 +20,9 @@ from matplotlib.figure import Figure
 
 from benchmarks.rows import Row
 from benchmarks.summary import say
-from perception.record import RecordConfig, Recorder
-from perception.source import Frame, open_source
+from perception.sources.frame import Frame
+from perception.sources.open_source import open_source
+from perception.sources.recorder import RecordConfig, Recorder
 
 NOISE = 2.0  # counts, standard deviation of each pixel's colour
 REALTIME = 30.0  # frames per second that a camera gives

@@ -12,19 +12,19 @@ from jaxtyping import Array, Float
 from benchmarks.results import refuse_cut
 from benchmarks.scene import GRID, VesselView
 from benchmarks.score import Answer, shapes_at
-from perception.controller import ControllerConfig, estimate
-from perception.crop import crop
-from perception.observe import ObjectFrame, observe
-from perception.seen import answered_voxels
-from perception.segment import Segment
-from perception.source import Frame
-from probnerf.baselines.map import MAPConfig, map_estimate
-from probnerf.infer import encoder_guess, likelihood_of
-from probnerf.model import Likelihood
-from probnerf.occupancy import coarsen
-from probnerf.prior import ProbNeRF
-from probnerf.proposal import Picture, guesses
-from probnerf.store import Prior
+from perception.inference.controller import ControllerConfig, estimate
+from perception.observation.encoder_crop import crop
+from perception.observation.rays import ObjectFrame, observe
+from perception.observation.segmentation import Segment
+from perception.observation.visibility import answered_voxels
+from perception.sources.frame import Frame
+from probnerf.inference import encoder_guess, likelihood_of
+from probnerf.likelihood.settings import Likelihood
+from probnerf.prior.checkpoint import Prior
+from probnerf.prior.networks import ProbNeRF
+from probnerf.prior.posterior_network import Picture, guesses
+from probnerf.rendering.occupancy import coarsen
+from probnerf.sampling.map_estimate import MAPConfig, map_estimate
 from probnerf.types import Observation
 
 POSTERIOR, PRIOR, ENCODER, MAP = METHODS = ("tempered_smc", "prior alone", "encoder alone", "map")

@@ -33,16 +33,22 @@ from matplotlib.figure import Figure
 from benchmarks.results import Line, append_line, digest, key, read_lines
 from benchmarks.rows import Row
 from benchmarks.summary import say, table
-from probnerf.analytic import draw_pixels, grid_of_rays
-from probnerf.infer import InferConfig, likelihood_of, likelihood_settings, opacity_grids
+from probnerf.fields.base import Model
+from probnerf.fields.cylinder import CylinderModel
+from probnerf.inference import InferConfig, likelihood_of, likelihood_settings
+from probnerf.likelihood.dispatch import log_likelihood
+from probnerf.likelihood.pixel_terms import faces_of_view
+from probnerf.likelihood.position import pose_of
+from probnerf.likelihood.settings import Likelihood
 from probnerf.metrics import coverage, ks_distance, randomised_rank, uniform_band
-from probnerf.model import POSE_SIZE, CylinderModel, Likelihood, Model, faces_of_view, log_likelihood, pose_of
-from probnerf.occupancy import solid, voxel_centres
-from probnerf.populations import thin
-from probnerf.prior import PRESETS, ProbNeRF
-from probnerf.smc import TemperedSMCConfig, tempered_smc
-from probnerf.store import load_prior
-from probnerf.types import Posterior
+from probnerf.objects.cylinder_scenes import draw_pixels, grid_of_rays
+from probnerf.prior.checkpoint import load_prior
+from probnerf.prior.networks import PRESETS, ProbNeRF
+from probnerf.rendering.occupancy import solid, voxel_centres
+from probnerf.sampling.populations import thin
+from probnerf.sampling.tempered_smc import TemperedSMCConfig, tempered_smc
+from probnerf.shapes import opacity_grids
+from probnerf.types import POSE_SIZE, Posterior
 
 RESULTS = Path(__file__).with_suffix(".jsonl")
 GRID = 24

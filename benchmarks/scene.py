@@ -12,14 +12,16 @@ from jaxtyping import Array, Bool, Float
 from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
-from perception.monocular import PlaneGuess
-from perception.observe import ObjectFrame, ObserveConfig, object_frame
-from perception.seen import seen_voxels
-from perception.segment import Segment, segment
-from perception.simulate import Picture, Placed, Scene, place_camera, render, sense, truth
-from perception.source import Frame
-from probnerf.families.render import pinhole_rays, trace
-from probnerf.families.tabletop import (
+from perception.observation.rays import ObjectFrame, ObserveConfig, object_frame
+from perception.observation.segmentation import Segment, segment
+from perception.observation.visibility import seen_voxels
+from perception.observation.without_depth import PlaneGuess
+from perception.simulation.sensor_faults import sense
+from perception.simulation.simulated_camera import Picture, Placed, Scene, place_camera, render, truth
+from perception.sources.frame import Frame
+from probnerf.geometry import pinhole_rays
+from probnerf.objects.ray_tracer import trace
+from probnerf.objects.tabletop import (
     TRAIN_SEEDS,
     TabletopObject,
     canonical_parts,
@@ -27,7 +29,7 @@ from probnerf.families.tabletop import (
     sample_objects,
     to_canonical,
 )
-from probnerf.occupancy import coarsen, solid, voxel_centres
+from probnerf.rendering.occupancy import coarsen, solid, voxel_centres
 from probnerf.types import BASE_Z, Pose
 
 GRID = 32  # voxels per axis that answers are judged on

@@ -9,11 +9,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from benchmarks.scene import GRID, VesselView
-from perception.hypotheses import Hypotheses
-from perception.query import CAUTION
-from probnerf import foam
-from probnerf.families.render import look_at, pinhole_rays, trace
-from probnerf.infer import opacity_grids, poses, without_sizes
+from perception.answers.hypotheses import Hypotheses
+from perception.answers.query import CAUTION
+from probnerf.fields.base import Model
+from probnerf.geometry import look_at, pinhole_rays
+from probnerf.inference import without_sizes
+from probnerf.likelihood.position import split_position
+from probnerf.likelihood.settings import Likelihood
 from probnerf.metrics import (
     hidden_brier,
     hidden_ece,
@@ -23,11 +25,13 @@ from probnerf.metrics import (
     scored_voxels,
     smooth_probability,
 )
-from probnerf.model import Likelihood, Model, split_position
-from probnerf.occupancy import coarsen, solid
-from probnerf.prior import ProbNeRF
+from probnerf.objects.ray_tracer import trace
+from probnerf.prior.encoder_input import ENCODER_RADIUS
+from probnerf.prior.networks import ProbNeRF
+from probnerf.rendering import foam
+from probnerf.rendering.occupancy import coarsen, solid
+from probnerf.shapes import opacity_grids, poses
 from probnerf.types import BASE_Z, Rays
-from probnerf.views import ENCODER_RADIUS
 
 BOXES = 16  # random unseen boxes per view
 

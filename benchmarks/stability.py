@@ -25,11 +25,11 @@ from benchmarks.scene import VesselPicture, base_rate, vessel_view
 from benchmarks.score import BOXES, as_queried, random_boxes, score
 from benchmarks.summary import interval, say, table
 from benchmarks.unseen import any_view
-from perception.controller import ControllerConfig, Estimate, estimate
-from perception.track import Tracker, Update
-from probnerf.families.tabletop import TEST_SEEDS
+from perception.inference.controller import ControllerConfig, Estimate, estimate
+from perception.inference.tracker import Tracker, Update
 from probnerf.metrics import falsely_free, paired_interval, scored_voxels
-from probnerf.store import Prior, load_prior
+from probnerf.objects.tabletop import TEST_SEEDS
+from probnerf.prior.checkpoint import Prior, load_prior
 
 RESULTS = Path(__file__).with_suffix(".jsonl")
 SHIPS = "as it ships"

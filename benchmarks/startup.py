@@ -26,12 +26,12 @@ EMPTY, FILLED = "empty cache", "filled cache"
 
 def _start(begun: float) -> dict[str, float]:
     """Seconds of each part, in this new process, which the parent began at `begun` (time.time)."""
-    from perception.log import Log
-    from perception.segment import segment
-    from perception.source import SHIPPED_LOG
-    from perception.track import Tracker
-    from perception.warm import warm_up
-    from probnerf.store import load_prior
+    from perception.inference.tracker import Tracker
+    from perception.inference.warm_up import warm_up
+    from perception.observation.segmentation import segment
+    from perception.sources.open_source import SHIPPED_LOG
+    from perception.sources.recording import Log
+    from probnerf.prior.checkpoint import load_prior
 
     imported = time.time()
     prior = load_prior(None)

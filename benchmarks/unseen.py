@@ -30,9 +30,9 @@ from benchmarks.scene import (
     vessel_picture,
     vessel_view,
 )
-from perception.simulate import Placed, Scene, render
-from probnerf.families.draw import CUP, MUG, PITCHER
-from probnerf.families.tabletop import TEST_SEEDS
+from perception.simulation.simulated_camera import Placed, Scene, render
+from probnerf.objects.tabletop import TEST_SEEDS
+from probnerf.objects.tabletop_sampler import CUP, MUG, PITCHER
 
 ANY, COLOUR, KNOWN = "any view", "any view, colour only", "any view, pose known"
 HALF, BEHIND, HANDLE = "half hidden", "no handle in sight", "handle hidden"

@@ -18,10 +18,10 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from node.bus import Bus
-from node.bus_config import BusConfig
-from node.message import QUERY_REGION, header, make, pose
-from node.serve import SWEPT
+from node.ros.bus import Bus
+from node.ros.bus_config import BusConfig
+from node.ros.messages import QUERY_REGION, header, make, pose
+from node.ros.services import SWEPT
 
 Way = TypeVar("Way")
 

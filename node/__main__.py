@@ -46,7 +46,7 @@ def _configured(kind: type[Options], prog: str, args: Sequence[str], load: Calla
     names = [f.name for f in fields(kind) if f.name != "config"]  # type: ignore[arg-type]
     config = into()
     if (path := options.config) is not None:  # type: ignore[attr-defined]
-        from node.config import load_config
+        from node.commands.config_file import load_config
 
         config = load_config(path, into)  # its values become the defaults, and the options are read again
         options = tyro.cli(kind, args=args, prog=prog, default=kind(**{n: getattr(config, n) for n in names}))
@@ -55,27 +55,27 @@ def _configured(kind: type[Options], prog: str, args: Sequence[str], load: Calla
 
 def _replay(args: Sequence[str]) -> int:
     def load() -> type:
-        from node.pipeline import ReplayConfig
+        from node.commands.replay import ReplayConfig
 
         return ReplayConfig
 
     config = _configured(Replay, "farside replay", args, load)
-    from node.pipeline import replay
+    from node.commands.replay import replay
 
     run = replay
     if config.schedule:
-        from node.follow import follow as run
+        from node.commands.replay_schedule import follow as run
     return 0 if run(config, Console(), Console(stderr=True)) else 130
 
 
 def _live(args: Sequence[str]) -> int:
     def load() -> type:
-        from node.live import LiveConfig
+        from node.commands.live import LiveConfig
 
         return LiveConfig
 
     config = _configured(Live, "farside live", args, load)
-    from node.live import live
+    from node.commands.live import live
 
     live(config, Console(), Console(stderr=True))
     return 0
@@ -83,7 +83,7 @@ def _live(args: Sequence[str]) -> int:
 
 def _record(args: Sequence[str]) -> int:
     options = tyro.cli(Record, args=args, prog="farside record")
-    from node.recording import record
+    from node.commands.record import record
 
     record(options, Console(), Console(stderr=True))
     return 0
@@ -94,10 +94,10 @@ def _query(args: Sequence[str]) -> int:
     box, points, mesh = options.box, options.points, options.mesh
     if sum(given is not None for given in (box, points, mesh)) != 1:
         raise ValueError("a query needs one of --box X0 Y0 Z0 X1 Y1 Z1, --points FILE.xyz and --mesh FILE.obj")
-    from node.answer import answer
-    from perception.region import Box, Region, read_mesh
-    from perception.store import load_scene
-    from perception.xyz import read_points
+    from node.figures.query_answer import answer
+    from perception.answers.hypotheses_file import load_scene
+    from perception.answers.regions import Box, Region, read_mesh
+    from perception.answers.xyz import read_points
 
     scene = load_scene(options.file)
     region: Region
@@ -119,11 +119,11 @@ def _view(args: Sequence[str]) -> int:
     if options.live is not None:
         if options.out is not None:
             raise ValueError("--out draws a file's picture; leave it away with --live")
-        from node.watch import watch
+        from node.commands.view_live import watch
 
         watch(options.live, options.node, options.port, Console(), Console(stderr=True))
         return 0
-    from node.view import draw, open_page
+    from node.commands.view import draw, open_page
 
     assert options.file is not None
     if options.out is None:
@@ -137,7 +137,7 @@ def _calibrate(args: Sequence[str]) -> int:
     options = tyro.cli(Calibrate, args=args, prog="farside calibrate")
     if sum(given is not None for given in (options.source, options.from_, options.print_target)) != 1:
         raise ValueError("give one of SOURCE (pictures of a board), --from SOURCE and --print-target FILE.pdf")
-    from node.calibration import calibrate_camera, copy_camera, print_target
+    from node.commands.calibrate import calibrate_camera, copy_camera, print_target
 
     if options.print_target is not None:
         print_target(options.print_target, options.board, options.paper, Console())
@@ -150,13 +150,13 @@ def _calibrate(args: Sequence[str]) -> int:
 
 def _capture(args: Sequence[str]) -> int:
     options = tyro.cli(Capture, args=args, prog="farside capture")
-    from node.capture import capture
+    from node.commands.capture import capture
 
     return 0 if capture(options, Console(), Console(stderr=True)) else 130
 
 
 def _train(args: Sequence[str]) -> int:
-    from node.training import Training, train
+    from node.commands.train import Training, train
 
     options = tyro.cli(
         Training, args=args, prog="farside train", description=TRAIN, config=(tyro.conf.OmitArgPrefixes,)
@@ -165,7 +165,7 @@ def _train(args: Sequence[str]) -> int:
 
 
 def _bench(args: Sequence[str]) -> int:
-    from node.bench import load_benchmark, names, run
+    from node.commands.bench import load_benchmark, names, run
 
     found = names()
     if not args or args[0] not in found:
@@ -237,8 +237,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         _end(main(sys.argv[1:]))
     given = list(argv)
     args = [a for a in given if a != "--debug"]
-    # Compiled programs outlive the process: the large ones by `probnerf.programs`, the small ones by JAX, which reads
-    # these when it is first imported.
+    # Compiled programs outlive the process: `probnerf.compile_cache` keeps the large ones, JAX the small ones. JAX
+    # reads these variables when it is first imported.
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "farside"
     os.environ.setdefault("FARSIDE_PROGRAMS", str(cache))
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))

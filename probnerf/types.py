@@ -20,6 +20,9 @@ BASE_Z = -0.75
 # Pixel statuses of an Observation (object / free / unknown).
 UNKNOWN, OBJECT, FREE = 0, 1, 2
 
+# Entries of a position vector that tell the pose: a, b (yaw = atan2(b, a)), x, y, log-scale, range offset, z.
+POSE_SIZE = 7
+
 
 def on_device(values: ArrayLike, dtype: DTypeLike = np.float32) -> Array:
     """NumPy's array of these, on the device. `jnp.asarray` may compile a program for it, and a new process many."""

@@ -29,6 +29,30 @@ MAY_IMPORT: dict[str, set[str]] = {
 }
 PACKAGES = ("calibration", "probnerf", "perception", "node")  # installed; `benchmarks` runs from a checkout
 
+# Inside a folder: its rooms and files from the lowest layer to the highest. Each may import its own layer and those
+# before it; circles are excluded by a test of their own.
+LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "calibration": (
+        ("boards", "camera", "turntable"),
+        ("calibrate", "camera_file", "print_board", "turntable_pose"),
+        ("coverage",),
+    ),
+    "probnerf": (
+        ("geometry", "metrics", "types"),
+        ("kernel",),
+        ("compile_cache", "fields"),
+        ("rendering",),
+        ("likelihood",),
+        ("prior",),
+        ("sampling",),
+        ("inference", "shapes"),
+        ("objects",),
+        ("training",),
+    ),
+    "perception": (("sources",), ("observation",), ("answers",), ("inference",), ("simulation",)),
+    "node": (("figures", "options"), ("ros", "viewer"), ("commands",), ("__main__",)),
+}
+
 # An outside library and the files that may import it: one per purpose. `*` also matches folders; tests import freely.
 IMPORTERS: dict[str, tuple[str, ...]] = {
     "numpy": ("*",),
@@ -36,72 +60,107 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     # JAX is probnerf's; perception meets it only where arrays are handed over.
     "jax": (
         "probnerf/*",
-        "perception/observe.py",
-        "perception/crop.py",
-        "perception/controller.py",
-        "perception/publish.py",
-        "perception/warm.py",
+        "perception/observation/rays.py",
+        "perception/observation/encoder_crop.py",
+        "perception/inference/controller.py",
+        "perception/inference/publish.py",
+        "perception/inference/warm_up.py",
         "benchmarks/*",
     ),
     "equinox": ("probnerf/*", "benchmarks/*"),
-    "optax": ("probnerf/ascent.py", "probnerf/train.py", "probnerf/baselines/*"),
-    "safetensors": ("probnerf/store.py",),
+    "optax": ("probnerf/sampling/*", "probnerf/training/elbo.py"),
+    "safetensors": ("probnerf/prior/checkpoint.py",),
     "blackjax": (),  # an independent sampler to test against
-    "cv2": ("calibration/*", "perception/*", "probnerf/families/srn.py"),  # the last: PNG files, resized
+    "cv2": ("calibration/*", "perception/*", "probnerf/training/srn_dataset.py"),  # the last: PNG files, resized
     "scipy": (
-        "node/message.py",
-        "probnerf/occupancy.py",
-        "probnerf/batches.py",
+        "node/ros/messages.py",
+        "probnerf/rendering/occupancy.py",
+        "probnerf/training/batches.py",
         "probnerf/metrics.py",
         "perception/*",
         "benchmarks/*",
     ),
-    "skimage": ("probnerf/occupancy.py", "perception/*"),
+    "skimage": ("probnerf/rendering/occupancy.py", "perception/*"),
     "serial": ("calibration/turntable.py",),
-    "depthai": ("perception/oak.py",),
-    "rosbags": ("perception/log.py", "perception/record.py", "node/message.py"),  # recorded logs; messages on the bus
-    "mcap": ("perception/log.py", "perception/record.py"),
-    "yaml": ("calibration/camera_info.py", "node/config.py"),  # camera files; launch files
-    "zenoh": ("node/bus.py",),
-    "viser": ("node/page.py",),
-    "xxhash": ("node/wire.py",),
+    "depthai": ("perception/sources/oak.py",),
+    # recorded logs; messages on the bus
+    "rosbags": ("perception/sources/recording.py", "perception/sources/recorder.py", "node/ros/messages.py"),
+    "mcap": ("perception/sources/recording.py", "perception/sources/recorder.py"),
+    "yaml": ("calibration/camera_file.py", "node/commands/config_file.py"),  # camera files; launch files
+    "zenoh": ("node/ros/bus.py",),
+    "viser": ("node/viewer/page.py",),
+    "xxhash": ("node/ros/rmw_zenoh.py",),
     "tyro": ("node/__main__.py", "node/options.py", "benchmarks/*", "examples/*"),
-    "trimesh": ("perception/region.py", "benchmarks/mesh.py"),
+    "trimesh": ("perception/answers/regions.py", "benchmarks/mesh.py"),
     "rich": ("node/*", "benchmarks/*"),
-    "matplotlib": ("node/plot*.py", "benchmarks/*"),
+    "matplotlib": ("node/figures/*", "benchmarks/*"),
 }
 
 CAN_EXECUTE_CODE = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve"}
 Rule = Callable[[PurePosixPath, ast.Module], Iterator[str]]
 
 
-def imports(path: PurePosixPath, tree: ast.AST) -> Iterator[str]:
-    """Top-level names of all modules that a file imports, inside functions and relative or by name, too."""
+def imported_modules(path: PurePosixPath, tree: ast.AST) -> Iterator[str]:
+    """Dotted names of all modules that a file imports, inside functions and relative or by name, too."""
     for node in ast.walk(tree):
         match node:
             case ast.Import(names=names):
-                yield from (name.name.split(".")[0] for name in names)
-            case ast.ImportFrom(module=module, level=0) if module:
-                yield module.split(".")[0]
+                yield from (name.name for name in names)
             case ast.ImportFrom(module=module, names=names, level=level):
-                inside = path.parts[: -level or None]
-                yield inside[0] if inside else (module or names[0].name).split(".")[0]
+                parts = [*(path.parts[:-level] if level else ()), *(module.split(".") if module else ())]
+                for name in names:  # a name from a package may be its file
+                    file = ROOT.joinpath(*parts, name.name)
+                    yield ".".join([*parts, name.name] if file.with_suffix(".py").is_file() or file.is_dir() else parts)
             case ast.Call(
                 func=ast.Name(id="__import__") | ast.Attribute(attr="import_module") | ast.Name(id="import_module"),
                 args=[ast.Constant(value=str(name)), *_],
             ):
-                yield name.split(".")[0]
+                yield name
+
+
+def imports(path: PurePosixPath, tree: ast.AST) -> set[str]:
+    """Top-level names of the same."""
+    return {module.split(".")[0] for module in imported_modules(path, tree)}
 
 
 def breaks_diamond(path: PurePosixPath, tree: ast.Module) -> Iterator[str]:
     folder = path.parts[0]
-    for other in sorted(set(imports(path, tree)) & {*MAY_IMPORT, "tests", "launch"} - {folder} - MAY_IMPORT[folder]):
+    for other in sorted(imports(path, tree) & {*MAY_IMPORT, "tests", "launch"} - {folder} - MAY_IMPORT[folder]):
         yield f"{path} imports {other}, which {folder} must not know"
+
+
+def breaks_layers(path: PurePosixPath, tree: ast.Module) -> Iterator[str]:
+    folder, room = path.parts[0], path.parts[1].removesuffix(".py")
+    layers = LAYERS.get(folder, ())
+    height = {name: i for i, layer in enumerate(layers) for name in layer}
+    if not layers or room == "__init__":
+        return
+    if room not in height:
+        yield f"{path}: {room} stands in no layer of {folder} (LAYERS)"
+        return
+    for module in sorted(set(imported_modules(path, tree))):
+        parts = module.split(".")
+        if parts[0] == folder and len(parts) > 1 and height.get(parts[1], -1) > height[room]:
+            yield f"{path} imports {module}, which stands above it"
+
+
+def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Groups of modules that import each other, directly or through others."""
+    reach: dict[str, set[str]] = {}
+    for start in graph:
+        found, waiting = set[str](), list(graph[start])
+        while waiting:
+            if (module := waiting.pop()) not in found:
+                found.add(module)
+                waiting += graph.get(module, ())
+        reach[start] = found
+    together = {frozenset(b for b in reach[a] if a in reach.get(b, ())) for a in graph if a in reach[a]}
+    return sorted(sorted(group) for group in together)
 
 
 def breaks_importer_rule(path: PurePosixPath, tree: ast.Module) -> Iterator[str]:
     ours = {*MAY_IMPORT, "tests", "launch"}
-    for library in sorted(set(imports(path, tree)) - ours - sys.stdlib_module_names):
+    for library in sorted(imports(path, tree) - ours - sys.stdlib_module_names):
         allowed = IMPORTERS.get(library)
         if allowed is None:
             yield f"{path} imports {library}, which is not in the table of outside libraries (IMPORTERS)"
@@ -110,9 +169,9 @@ def breaks_importer_rule(path: PurePosixPath, tree: ast.Module) -> Iterator[str]
 
 
 def can_execute_code(path: PurePosixPath, tree: ast.Module) -> Iterator[str]:
-    if str(path) == "probnerf/programs.py":  # what it reads back is machine code, kept beside that of JAX
+    if str(path) == "probnerf/compile_cache.py":  # what it reads back is machine code, kept beside that of JAX
         return
-    for module in sorted(set(imports(path, tree)) & CAN_EXECUTE_CODE):
+    for module in sorted(imports(path, tree) & CAN_EXECUTE_CODE):
         yield f"{path} imports {module}: a file that it reads could execute code"
     for node in ast.walk(tree):
         if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
@@ -148,6 +207,7 @@ def has_untyped_signature(path: PurePosixPath, tree: ast.Module) -> Iterator[str
 
 RULES = (
     breaks_diamond,
+    breaks_layers,
     breaks_importer_rule,
     can_execute_code,
     has_global_state,
@@ -175,6 +235,15 @@ def project() -> dict:
 def test_no_file(rule: Rule) -> None:
     complaints = [line for path in files_of(*MAY_IMPORT) for line in rule(path, tree_of(path))]
     assert not complaints, "\n" + "\n".join(complaints)
+
+
+def test_no_files_import_each_other() -> None:
+    graph = {
+        ".".join(path.with_suffix("").parts).removesuffix(".__init__"): set(imported_modules(path, tree_of(path)))
+        for path in files_of(*MAY_IMPORT)
+    }
+    assert not circles(graph)
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]  # and one would be found
 
 
 def test_no_file_is_long() -> None:
@@ -205,7 +274,7 @@ def test_every_imported_library_is_declared() -> None:
     undeclared = []
     for folders, declared in ((tuple(MAY_IMPORT), runtime), (("tests",), developer)):
         for path in files_of(*folders):
-            for library in sorted(set(imports(path, tree_of(path))) - sys.stdlib_module_names - {*MAY_IMPORT, "tests"}):
+            for library in sorted(imports(path, tree_of(path)) - sys.stdlib_module_names - {*MAY_IMPORT, "tests"}):
                 if not names(distributions.get(library, [library])) & declared:
                     undeclared.append(f"{path} imports {library}, which pyproject.toml does not declare")
     assert not undeclared, "\n" + "\n".join(undeclared)
@@ -233,13 +302,20 @@ def test_launch_holds_no_python_package() -> None:
     [
         (breaks_diamond, "probnerf/a.py", "def f():\n    from calibration.camera import Camera", "imports calibration"),
         (breaks_diamond, "perception/a.py", "from .. import node", "imports node"),
-        (breaks_diamond, "probnerf/families/a.py", "from ...node.bus import Bus", "imports node"),
-        (breaks_diamond, "calibration/a.py", "importlib.import_module('perception.source')", "imports perception"),
+        (breaks_diamond, "probnerf/fields/a.py", "from ...node.bus import Bus", "imports node"),
+        (breaks_layers, "perception/sources/a.py", "from perception.answers.query import query", "stands above it"),
+        (breaks_layers, "probnerf/a.py", "", "stands in no layer of probnerf"),
+        (
+            breaks_diamond,
+            "calibration/a.py",
+            "importlib.import_module('perception.sources.open_source')",
+            "imports perception",
+        ),
         (
             breaks_importer_rule,
             "perception/a.py",
             "import zenoh.ext",
-            "perception/a.py imports zenoh, which only node/bus.py",
+            "perception/a.py imports zenoh, which only node/ros/bus.py",
         ),
         (
             breaks_importer_rule,
@@ -269,4 +345,4 @@ def area(x: float, *, y: float = 1) -> float:
 def _times(x, y): return x * y
 np.load("f", allow_pickle=False)
 """
-    assert not list(rule(PurePosixPath("probnerf/families/a.py"), ast.parse(source)))
+    assert not list(rule(PurePosixPath("probnerf/objects/a.py"), ast.parse(source)))

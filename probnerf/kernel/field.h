@@ -1,4 +1,4 @@
-// MLPField on a tile of points, forwards and backwards: the arithmetic of probnerf/field.py. Hidden units and features
+// MLPField on a tile of points, forwards and backwards: the arithmetic of probnerf/fields/mlp.py. Hidden units and features
 // stand along the vectors' lanes ([point][unit]), except that encodings are computed for LANES points at a time.
 #pragma once
 
@@ -199,7 +199,7 @@ inline float dot(const float* a, const float* b, int count) {
   return sum(t);
 }
 
-// Features [x, sin 2^j pi x, cos 2^j pi x] of every channel, in the order of probnerf.field.encode.
+// Features [x, sin 2^j pi x, cos 2^j pi x] of every channel, in the order of probnerf.fields.mlp.encode.
 inline void encode(const Sizes& s, const float* x, int channels, int octaves, float* out, int n) {
   for (int c = 0; c < channels; ++c)
     for (int p = 0; p < n; p += LANES) {

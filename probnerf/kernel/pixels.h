@@ -1,5 +1,5 @@
 // What the pixels of a tile's rays say, and its gradient by density, colour, scale and range offset: the arithmetic of
-// probnerf.model.pixel_terms, with weights and probabilities as they are where that has logarithms. Nothing underflows:
+// probnerf.likelihood.pixel_terms.pixel_terms, with weights and probabilities as they are where that has logarithms. Nothing underflows:
 // every sum holds a constant share (the outliers of a range, the errors of a mask).
 #pragma once
 

@@ -1,4 +1,4 @@
-// Where a tile's points are in the object's frame: the pose (probnerf.types.Pose) and the window (probnerf.foam.window).
+// Where a tile's points are in the object's frame: the pose (probnerf.types.Pose) and the window (probnerf.rendering.foam.window).
 #pragma once
 
 #include "field.h"

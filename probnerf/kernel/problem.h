@@ -5,12 +5,12 @@
 
 constexpr int MOST_OCTAVES = 20;  // of more, single precision has no digits left
 
-struct FieldSizes {  // probnerf.field.MLPField
+struct FieldSizes {  // probnerf.fields.mlp.MLPField
   int width, octaves, direction_octaves, radial, fitted;
   float density_scale;
 };
 
-struct PixelModel {  // probnerf.model.Likelihood
+struct PixelModel {  // probnerf.likelihood.settings.Likelihood
   float mask_error, outlier, outlier_span, wall_sigma, colour_sigma, per_density;  // per_density: 1 / G
 };
 

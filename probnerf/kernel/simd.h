@@ -129,7 +129,7 @@ inline Vec log1p(Vec x) {
   return log(y) + (x - (y - 1.0f)) / y;
 }
 
-// sin(pi u), cos(pi u): the arithmetic of probnerf.field.sincospi.
+// sin(pi u), cos(pi u): the arithmetic of probnerf.fields.mlp.sincospi.
 inline void sincospi(Vec u, Vec& sine, Vec& cosine) {
   Vec half = 0.5f * u;
   Vec h = half - nearest(half);

@@ -6,7 +6,7 @@
 
 namespace FARSIDE_NAMESPACE {
 
-constexpr float FAR = 1e3f;  // probnerf.foam.FAR
+constexpr float FAR = 1e3f;  // probnerf.rendering.foam.FAR
 constexpr int OBJECT = 1;
 
 struct TileRange {
@@ -58,7 +58,7 @@ struct Prepared {
           c.t[point] = t[k];
           c.floor[point] = ranged ? m.outlier / m.outlier_span : 1.0f;
           if (!ranged) continue;
-          // the surface lies in the gap before the face (probnerf.foam.gap_before)
+          // the surface lies in the gap before the face (probnerf.rendering.foam.gap_before)
           float gap = k ? t[k] - t[k - 1] : (n > 1 ? t[1] - t[0] : 0.0f);
           float variance = v.range_sigma[i] * v.range_sigma[i] + m.wall_sigma * m.wall_sigma + gap * gap / 12.0f;
           c.measured[point] = v.range[i] - (t[k] - 0.5f * gap);

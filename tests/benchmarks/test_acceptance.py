@@ -17,8 +17,8 @@ from benchmarks.acceptance import (
     quadrature_colours,
     view_rays,
 )
-from probnerf.prior import PRESETS, ProbNeRF
-from probnerf.store import load_prior
+from probnerf.prior.checkpoint import load_prior
+from probnerf.prior.networks import PRESETS, ProbNeRF
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from benchmarks.rivals import METHODS, POSTERIOR, RivalConfig
 from benchmarks.sbc import CONDITIONS, STATISTICS, identity, main, outside, ranks_of
 from benchmarks.scene import pixels_of_handle
 from benchmarks.unseen import BEHIND, SORTS
-from perception.controller import ControllerConfig
+from perception.inference.controller import ControllerConfig
 from probnerf.metrics import ECE_BINS, uniform_band
 
 

@@ -11,8 +11,8 @@ import pytest
 from benchmarks import chains
 from benchmarks.chains import ANNEALED, COMPARED, CONDITION, FIXED, SMC, main, relative_spread, unexplained
 from benchmarks.methods import VI, settings_of
-from perception.controller import ControllerConfig
-from probnerf.store import load_prior
+from perception.inference.controller import ControllerConfig
+from probnerf.prior.checkpoint import load_prior
 
 
 def test_spread_is_the_weighted_deviation_over_the_mean() -> None:

@@ -3,7 +3,7 @@
 import pytest
 
 from benchmarks.effort import EASY, HARD, scenes
-from probnerf.families.tabletop import KINDS, TEXTURES
+from probnerf.objects.tabletop import KINDS, TEXTURES
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from benchmarks.frontier_chart import draw_frontier
 from benchmarks.methods import CONDITIONS, FULL, METHODS
 from benchmarks.results import append_line, key, read_lines
 from benchmarks.scene import ViewConfig, base_rate, vessel_picture, vessel_view
-from probnerf.families.tabletop import part_distances
+from probnerf.objects.tabletop import part_distances
 
 VESSEL = 2_000_001
 LINE = {"prior": "p", "method": "m", "settings": {"a": 1, "b": 2}, "condition": "c", "object": 3, "seed": 0}

@@ -12,11 +12,11 @@ import pytest
 import benchmarks.handle as handle
 from benchmarks.handle import FROM_PRIOR, OWN, PRIOR, REACH, has_handle, log_score, main, reach
 from benchmarks.score import Answer
-from perception.simulate import Placed
-from probnerf.families.draw import MUG, PITCHER
-from probnerf.families.tabletop import TEST_SEEDS, TRAIN_SEEDS, signed_distance
-from probnerf.occupancy import voxel_centres
-from probnerf.store import load_prior
+from perception.simulation.simulated_camera import Placed
+from probnerf.objects.tabletop import TEST_SEEDS, TRAIN_SEEDS, signed_distance
+from probnerf.objects.tabletop_sampler import MUG, PITCHER
+from probnerf.prior.checkpoint import load_prior
+from probnerf.rendering.occupancy import voxel_centres
 
 
 def test_of_the_family_s_shapes_those_with_a_handle_are_told_from_those_without() -> None:

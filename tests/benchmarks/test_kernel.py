@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks import kernel
-from probnerf import fused
-from probnerf.prior import PRESETS
+from probnerf.kernel import library
+from probnerf.prior.networks import PRESETS
 
 
 def test_the_networks_sizes_are_their_weights_without_biases() -> None:
@@ -19,7 +19,7 @@ def test_the_networks_sizes_are_their_weights_without_biases() -> None:
 @pytest.mark.slow
 def test_rows_and_a_picture_come_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernel, "SIDE", 64)
-    if not fused.available():
+    if not library.available():
         with pytest.raises(ValueError, match="install a C\\+\\+ compiler"):
             kernel.main(tmp_path)
         return

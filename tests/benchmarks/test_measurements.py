@@ -22,15 +22,15 @@ from benchmarks.rivals import METHODS, POSTERIOR
 from benchmarks.scene import GRID, base_rate, hidden_vessel, told_pose, vessel_picture, vessel_view
 from benchmarks.score import Answer, random_boxes, shapes_at
 from benchmarks.summary import mean_rows
-from perception.controller import ControllerConfig, estimate
-from perception.monocular import PlaneGuess
-from perception.plane import heights
-from perception.seen import answered_voxels
-from perception.segment import segment
-from perception.source import read_frame_folder
-from probnerf.infer import InferConfig, quick_smc
-from probnerf.occupancy import coarsen, voxel_centres
-from probnerf.store import load_prior
+from perception.inference.controller import ControllerConfig, estimate
+from perception.observation.segmentation import segment
+from perception.observation.support_plane import heights
+from perception.observation.visibility import answered_voxels
+from perception.observation.without_depth import PlaneGuess
+from perception.sources.frame_folder import read_frame_folder
+from probnerf.inference import InferConfig, quick_smc
+from probnerf.prior.checkpoint import load_prior
+from probnerf.rendering.occupancy import coarsen, voxel_centres
 from probnerf.types import BASE_Z
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks.next_view import CHOICES, FARTHEST, NONE, RANDOM, SUGGESTED, _rows, places
-from perception.next_view import rank_views, ring_of_views
-from tests.perception.test_next_view import HIDDEN
+from perception.answers.next_view import rank_views, ring_of_views
+from tests.perception.answers.test_next_view import HIDDEN
 
 
 def test_the_suggested_place_gains_most_and_the_farthest_is_opposite() -> None:

@@ -9,7 +9,7 @@ import trimesh
 from benchmarks.mesh import enclosed, mesh_view
 from benchmarks.out_of_model import CONDITIONS, FAMILY, detection, main
 from benchmarks.results import append_line
-from probnerf.store import load_prior
+from probnerf.prior.checkpoint import load_prior
 
 
 @pytest.fixture(scope="module")

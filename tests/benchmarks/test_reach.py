@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.reach import BELIEFS, FARSIDE, FREE, GRID, INDEPENDENT, OCCUPIED, Belief, tasks_of
 from examples.reach import Gripper, choose, reaches
-from probnerf.occupancy import voxel_centres
+from probnerf.rendering.occupancy import voxel_centres
 
 CENTRES = voxel_centres(GRID)
 

@@ -9,10 +9,10 @@ from benchmarks.faults import AXES, Axis, noise_frame, occlusion
 from benchmarks.scene import base_rate, vessel_view
 from benchmarks.stability import FIRST, Seen, look, main
 from benchmarks.unseen import any_view
-from perception.controller import ControllerConfig
-from perception.source import Frame
-from probnerf.families.tabletop import TEST_SEEDS
-from probnerf.store import load_prior
+from perception.inference.controller import ControllerConfig
+from perception.sources.frame import Frame
+from probnerf.objects.tabletop import TEST_SEEDS
+from probnerf.prior.checkpoint import load_prior
 
 FAULTS = [axis for axis in AXES if axis.fault is not None]
 CONFIGURED = [axis for axis in AXES if axis.configured is not None]

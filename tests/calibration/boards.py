@@ -5,9 +5,9 @@ from functools import cache
 import cv2
 import numpy as np
 
+from calibration.boards import Board, parse_board
 from calibration.calibrate import View
 from calibration.camera import Camera
-from calibration.target import Board, parse_board
 
 K = np.array([[430.0, 0.0, 310.0], [0.0, 432.0, 221.0], [0.0, 0.0, 1.0]])
 WIDE = np.array([[258.0, 0.0, 310.0], [0.0, 259.0, 221.0], [0.0, 0.0, 1.0]])

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
+from calibration.boards import parse_board
 from calibration.calibrate import CalibrateConfig, View, calibrate, distinct
-from calibration.target import parse_board
 from tests.calibration.boards import CAMERAS, SIZE, views
 
 CONFIG = CalibrateConfig()

@@ -5,11 +5,11 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from node.bus import Bus
-from node.bus_config import BusConfig
-from node.message import frame_messages
-from node.topic_source import TopicConfig
-from perception.log import Log
+from node.ros.bus import Bus
+from node.ros.bus_config import BusConfig
+from node.ros.messages import frame_messages
+from node.ros.topic_source import TopicConfig
+from perception.sources.recording import Log
 
 
 def play(endpoint: str, path: Path, rate: float) -> None:

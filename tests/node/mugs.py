@@ -8,14 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.camera import Camera
-from perception.hypotheses import Hypotheses
-from perception.observe import observe
-from perception.seen import seen_voxels
-from perception.segment import Segment
-from perception.simulate import Placed, Scene, place_camera, simulate
-from perception.source import Frame
-from probnerf.families.tabletop import signed_distance
-from probnerf.occupancy import voxel_centres
+from perception.answers.hypotheses import Hypotheses
+from perception.observation.rays import observe
+from perception.observation.segmentation import Segment
+from perception.observation.visibility import seen_voxels
+from perception.simulation.sensor_faults import simulate
+from perception.simulation.simulated_camera import Placed, Scene, place_camera
+from perception.sources.frame import Frame
+from probnerf.objects.tabletop import signed_distance
+from probnerf.rendering.occupancy import voxel_centres
 from probnerf.types import Pose
 
 MUG = Placed(2_900_727, 0.0, -0.06, np.pi)

@@ -4,9 +4,9 @@ import socket
 
 import numpy as np
 
-from perception.hypotheses import Hypotheses
-from perception.observe import ObjectFrame
-from probnerf.occupancy import voxel_centres
+from perception.answers.hypotheses import Hypotheses
+from perception.observation.rays import ObjectFrame
+from probnerf.rendering.occupancy import voxel_centres
 
 GRID, HALF_EXTENT = 32, 0.16
 BODY = ((-0.04, -0.04, -0.08), (0.04, 0.04, 0.08))  # metres, object frame

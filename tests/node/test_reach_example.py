@@ -3,10 +3,10 @@
 import pytest
 
 from examples.reach import main
-from node.bus import Bus
-from node.bus_config import BusConfig
-from node.message import QUERY_REGION
-from node.serve import Answers
+from node.ros.bus import Bus
+from node.ros.bus_config import BusConfig
+from node.ros.messages import QUERY_REGION
+from node.ros.services import Answers
 from tests.node.shapes import body_with_handle, free_port
 
 

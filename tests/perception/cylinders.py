@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.camera import Camera
-from perception.source import Frame
+from perception.sources.frame import Frame
 
 CAMERA = Camera(320, 240, np.array([[310.0, 0.0, 159.5], [0.0, 310.0, 119.5], [0.0, 0.0, 1.0]]), np.zeros(5))
 TABLE_RADIUS, FLOOR, WALL = 0.45, -0.7, 1.6  # m

@@ -10,8 +10,8 @@ import depthai as dai
 import numpy as np
 
 from calibration.camera import Camera
-from perception.oak import Opened
-from perception.source import Frame
+from perception.sources.frame import Frame
+from perception.sources.oak import Opened
 
 CLOCK_NS = 1_700_000_000_000_000_000  # UNIX time less the pipeline's clock
 CAMERA = Camera(64, 48, np.array([[60.0, 0.0, 31.0], [0.0, 61.0, 23.0], [0.0, 0.0, 1.0]]), np.arange(1.0, 9.0) / 100,

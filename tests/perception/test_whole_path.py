@@ -10,18 +10,19 @@ import trimesh
 
 from benchmarks.mesh import Cloud, picture_of
 from benchmarks.scene import ViewConfig, simulated_camera
-from perception.controller import ControllerConfig, Estimate, estimate
-from perception.observe import BODY_EXTENT, ObserveConfig
-from perception.query import query
-from perception.region import Box
-from perception.segment import segment
-from perception.simulate import place_camera, sense
-from perception.source import Frame
-from probnerf.analytic import integrate, total_variation, yaw_histogram
-from probnerf.field import CylinderField
-from probnerf.infer import opacity_grids
-from probnerf.model import CylinderModel, faces_of_view, log_likelihood_one
-from probnerf.store import Prior
+from perception.answers.query import query
+from perception.answers.regions import Box
+from perception.inference.controller import ControllerConfig, Estimate, estimate
+from perception.observation.rays import BODY_EXTENT, ObserveConfig
+from perception.observation.segmentation import segment
+from perception.simulation.sensor_faults import sense
+from perception.simulation.simulated_camera import place_camera
+from perception.sources.frame import Frame
+from probnerf.fields.cylinder import CylinderField, CylinderModel
+from probnerf.likelihood.pixel_terms import faces_of_view, log_likelihood_one
+from probnerf.objects.cylinder_scenes import integrate, total_variation, yaw_histogram
+from probnerf.prior.checkpoint import Prior
+from probnerf.shapes import opacity_grids
 
 HALF_EXTENT = 0.07  # m
 RADIUS, HANDLE = 0.45, 0.4  # cube units

@@ -6,10 +6,10 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
+from calibration.boards import parse_board
 from calibration.camera import Camera
-from calibration.target import parse_board
-from perception.source import Frame
-from probnerf.families.render import look_at
+from perception.sources.frame import Frame
+from probnerf.geometry import look_at
 
 BOARD = parse_board("charuco:7x7:0.03:0.022:DICT_4X4_50")
 LOW, HIGH = np.array([-0.02, -0.03, 0.0]), np.array([0.04, 0.01, 0.08])  # m, plate frame: the block

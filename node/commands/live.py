@@ -1,0 +1,340 @@
+"""`farside live`: frames in from a camera, hypotheses out to the bus, the page and a recording, until Ctrl-C.
+
+Three things happen at once, and none waits for another: a reader takes every frame from the camera; a keeper records
+every frame and hands it to whoever listens on the bus; this thread infers from the newest frame there is.
+"""
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+
+from calibration.camera_file import read_camera
+from node.ros.bus import Bus
+from node.ros.bus_config import BusConfig
+from node.ros.messages import HYPOTHESES, definition, encode, hypotheses_message
+from node.ros.parameters import flat, serve_parameters
+from node.ros.publishers import Announcer
+from node.ros.scene_messages import Level, Status
+from node.ros.services import Answers
+from node.ros.topic_source import TopicConfig, TopicSource
+from perception.answers.hypotheses import Hypotheses
+from perception.inference.controller import ControllerConfig
+from perception.inference.schedule import config_hash, scheduled
+from perception.inference.tracker import Look, TrackConfig, Tracker
+from perception.inference.warm_up import warm_up
+from perception.observation.segmentation import Segment, SegmentConfig, segment
+from perception.sources.frame import Frame, Source
+from perception.sources.open_source import open_source
+from perception.sources.playback import Playback
+from perception.sources.reader import Listener, Reader
+from perception.sources.recorder import RecordConfig, Recorder
+from perception.sources.recording import Log
+from probnerf.prior.checkpoint import load_prior
+
+HYPOTHESES_TOPIC = "/farside/hypotheses"
+ENDPOINT = "tcp/127.0.0.1:7448"  # the router of ROS 2 has 7447
+STATUS_S = 1.0  # between diagnostics
+KEPT = 1000  # stamps of recorded frames that are remembered
+
+
+@dataclass(frozen=True)
+class LiveConfig:
+    """Keys of a configuration file such as launch/live.yaml; the command's options have the same names."""
+
+    source: str = "oak"  # oak, oak:ID, webcam:N, topic (a camera driver on the bus), a recording, a video, ...
+    camera: Path | None = None  # calibration of the colour image
+    record: Path | None = None  # new MCAP file
+    budget: float = 40.0  # s of sampling for each object of a frame; what has not converged goes on with the next
+    pace: float = 1.0  # of a recording
+    seconds: float | None = None  # until it ends by itself
+    page: int | None = None  # port of the page on this machine; None: no page
+    seed: int = 0
+    prior: Path | None = None
+    bus: BusConfig = field(default_factory=lambda: BusConfig(listen=(ENDPOINT,)))
+    topic: TopicConfig = field(default_factory=TopicConfig)
+    recording: RecordConfig = field(default_factory=RecordConfig)
+    segment: SegmentConfig = field(default_factory=SegmentConfig)
+    controller: ControllerConfig = field(default_factory=ControllerConfig)
+    track: TrackConfig = field(default_factory=TrackConfig)
+
+    def __post_init__(self) -> None:
+        if not self.budget > 0:
+            raise ValueError(f"the budget is {self.budget:g} s; give more than 0")
+        if self.seconds is not None and not self.seconds > 0:
+            raise ValueError(f"seconds is {self.seconds:g}; give more than 0")
+        if not 0 <= self.seed < 1 << 32:
+            raise ValueError(f"the seed is {self.seed}; give 0 to {(1 << 32) - 1}")
+
+
+def live(config: LiveConfig, out: Console, err: Console) -> None:
+    """Run the node until Ctrl-C, `config.seconds`, or the source's end.
+
+    Raises OSError, ValueError or FileNotFoundError in one line for a source that is not there, an endpoint or port in
+    use, or a file that cannot be written; at the end, too, where the recording had broken off. What goes wrong with one
+    frame is said once and counted.
+    """
+    tracker = Tracker(load_prior(config.prior), config.controller, config.track, config.seed)
+    with ExitStack() as stack:
+        bus = stack.enter_context(Bus(config.bus, lambda text: err.print(text, highlight=False, soft_wrap=True)))
+        source = _open(config, bus)
+        page = None
+        if config.page is not None:
+            from node.viewer.page import Page  # viser takes a second to import
+
+            page = stack.enter_context(Page(config.page))
+        recorder = None  # after all that may fail: a run that did not begin leaves no file
+        if config.record is not None:
+            recorder = Recorder(config.record, config.recording)
+            stack.callback(_close, recorder)
+        announcer = Announcer(bus)
+        reader = Reader(source)
+        keeper = _Keeper(
+            reader.listen("keeper"),
+            recorder,
+            None if config.source == "topic" else announcer,
+            lambda text: bus.counts.add("camera", "failed", text),
+        )
+        stack.callback(keeper.close)  # when the reader is closed, and what waits is written
+        with err.status("compiling; from the second start on it takes seconds"):
+            warm_up(tracker)  # before the first frame: its stalls would hold up the reader
+        stack.enter_context(reader)
+        keeper.thread.start()
+        node = Node(config, tracker, announcer, reader, keeper, recorder, err)
+        node.answers.serve(bus)
+        serve_parameters(bus, flat(config))
+        if page is not None:
+            node.show = page.show
+            out.print(f"{page.address} shows it", highlight=False, soft_wrap=True)
+        where = ", ".join((*config.bus.listen, *config.bus.connect))
+        out.print(f"{announcer.node} is up on {where}; Ctrl-C ends it", highlight=False, soft_wrap=True)
+        try:
+            node.run(out)
+        except KeyboardInterrupt:
+            pass
+        counts = reader.counts()
+    out.print(node.tally(), highlight=False, soft_wrap=True)
+    for note in counts.notes:
+        err.print(f"note: {note}", highlight=False, soft_wrap=True)
+    if recorder is not None and recorder.error is not None:
+        raise OSError(recorder.error)
+
+
+def _open(config: LiveConfig, bus: Bus) -> Source:
+    if config.source == "topic":
+        return TopicSource(bus, config.topic)
+    source = open_source(config.source, None if config.camera is None else read_camera(config.camera))
+    return Playback(source, config.pace) if isinstance(source, Log) else source
+
+
+def _close(recorder: Recorder) -> None:
+    """End the recording; one without a frame leaves no file."""
+    recorder.close()
+    if not recorder.frames:
+        recorder.path.unlink(missing_ok=True)
+
+
+class _Keeper:
+    """Takes every frame: to the recording and to who listens on the bus."""
+
+    def __init__(
+        self,
+        listener: Listener,
+        recorder: Recorder | None,
+        announcer: Announcer | None,
+        trouble: Callable[[str], object],
+    ) -> None:
+        self.thread = threading.Thread(target=self._run, name="farside keeper", daemon=True)
+        self._listener, self._recorder, self._announcer = listener, recorder, announcer
+        self._trouble = trouble
+        self._recorded: deque[int] = deque(maxlen=KEPT)
+
+    def has(self, frame: Frame) -> bool:
+        """The recording has this frame, or there is no recording."""
+        return self._recorder is None or self._recorder.error is not None or frame.stamp_ns in self._recorded
+
+    def close(self) -> None:
+        """Wait until all that came is handed on."""
+        if self.thread.ident is not None:
+            self.thread.join(10.0)
+
+    def _run(self) -> None:
+        while True:
+            try:
+                frame = self._listener.take(0.5)
+            except Exception:  # the source's end is the main thread's to tell
+                return
+            if frame is None:
+                if self._listener.ended:
+                    return
+                continue
+            try:
+                if self._recorder is not None and self._recorder.write_frame(frame):
+                    self._recorded.append(frame.stamp_ns)
+                if self._announcer is not None:
+                    self._announcer.frame(frame)
+            except ValueError as error:  # one frame that no message can hold must not end all
+                self._trouble(str(error))
+
+
+class Node:
+    """Infers from the newest frame, and tells everybody what is known."""
+
+    def __init__(
+        self,
+        config: LiveConfig,
+        tracker: Tracker,
+        announcer: Announcer,
+        reader: Reader,
+        keeper: _Keeper,
+        recorder: Recorder | None,
+        err: Console,
+    ) -> None:
+        self.config, self.tracker, self.announcer, self.reader = config, tracker, announcer, reader
+        self.keeper, self.recorder, self.err = keeper, recorder, err
+        self.answers = Answers(announcer.node)
+        self.show: Callable[..., None] | None = None
+        self.frames = self.inferences = self.answered = 0
+        self._scene: dict[int, Hypotheses] = {}
+        self._said: dict[str, int] = {}  # what went wrong, and how often
+        self._hash = config_hash(config.controller, config.segment)
+        self._told = 0.0
+        self._recording_told = False
+        self._until = math.inf  # on time.monotonic()'s clock
+
+    def run(self, out: Console) -> None:
+        """Until the source or the time ends. Raises what the source raised."""
+        self._until = time.monotonic() + (math.inf if self.config.seconds is None else self.config.seconds)
+        while time.monotonic() < self._until:
+            frame = self.reader.newest(timeout=0.2)
+            self._tell_status()
+            if frame is None:
+                if self.reader.over:
+                    return
+                continue
+            if not self._kept(frame):
+                continue
+            self.frames += 1
+            try:
+                self.take(frame, out)
+            except ValueError as error:
+                self._trouble(str(error))
+
+    def _kept(self, frame: Frame) -> bool:
+        """What is inferred must be in the recording; a frame that was dropped there is passed over."""
+        until = time.monotonic() + 0.5
+        while not self.keeper.has(frame) and time.monotonic() < until:
+            time.sleep(0.005)
+        return self.keeper.has(frame)
+
+    def take(self, frame: Frame, out: Console) -> None:
+        """One frame: what is known of its objects at once, then what it adds to them."""
+        if self.config.source == "topic":  # of a driver's frames, those that hypotheses come of are told again
+            self.announcer.frame(frame)
+        try:
+            segments = segment(frame, None, self.config.segment)
+        except ValueError as error:
+            return self._trouble(str(error))
+        looks: list[tuple[Segment, Look]] = []
+        for found in segments:
+            try:
+                if (look := self.tracker.look(frame, found)) is not None:
+                    looks.append((found, look))
+            except ValueError as error:
+                self._trouble(f"object {found.id}: {error}")
+        ids = {look.object_id: found for found, look in looks}
+        self._scene = {look.object_id: look.hypotheses for _, look in looks if look.hypotheses is not None}
+        if self._scene or not looks:
+            self._publish(frame, ids)
+        for _, look in looks:
+
+            def answered(h: Hypotheses) -> None:
+                self._scene[h.object_id] = h
+                self._publish(frame, ids)
+                self._tell_status()
+
+            if look.settled:
+                self.tracker.infer(look)
+                continue
+            if (now := time.monotonic()) >= self._until:
+                return
+            deadline = min(now + self.config.budget, self._until)
+            update = self.tracker.infer(look, deadline=deadline, on_answer=answered)
+            self.inferences += 1
+            h = update.hypotheses
+            self._record(h, look)
+            said = {"new": "first seen", "moved": "has moved: begun anew", "view": "seen from another side"}
+            out.print(
+                f"object {h.object_id} {said.get(update.change, 'sampling went on')}: {h.result} at stage {h.stage},"
+                f" effective hypotheses {h.effective_hypotheses:.1f}, error {h.monte_carlo_error:.3f}",
+                highlight=False,
+                soft_wrap=True,
+            )
+            if h.result == "interrupted":  # the sampler took the Ctrl-C, which is meant for the whole node
+                raise KeyboardInterrupt
+
+    def _publish(self, frame: Frame, segments: dict[int, Segment]) -> None:
+        objects = list(self._scene.values())
+        self.answers.update(objects)
+        self.announcer.scene(objects, frame.camera, self.config.controller.infer.method)
+        self.answered += bool(objects)
+        if self.show is not None and objects:
+            from node.viewer.scene3d import CameraView
+
+            self.show(objects, CameraView(frame, segments))
+
+    def _record(self, h: Hypotheses, look: Look) -> None:
+        if self.recorder is None:
+            return
+        self.recorder.write_schedule(
+            scheduled(h, self._hash, "tracked" if look.change in ("view", "continued") else "fresh")
+        )
+        message = hypotheses_message(h, self.config.controller.infer.method)
+        data = bytes(encode(message))
+        self.recorder.write_raw(HYPOTHESES_TOPIC, HYPOTHESES, definition(HYPOTHESES), data, h.stamp_ns)
+
+    def _trouble(self, text: str) -> None:
+        """Say what is wrong with a frame once, and count it."""
+        kind = "".join(c for c in text if not c.isdigit())
+        self._said[kind] = self._said.get(kind, 0) + 1
+        if self._said[kind] == 1:
+            self.err.print(f"note: {text}", highlight=False, soft_wrap=True)
+
+    def _tell_status(self) -> None:
+        if self.recorder is not None and self.recorder.error is not None and not self._recording_told:
+            self._recording_told = True
+            self.err.print(f"recording has ended: {self.recorder.error}", highlight=False, soft_wrap=True)
+        now = time.monotonic()
+        if now - self._told < STATUS_S:
+            return
+        self._told = now
+        counts = self.reader.counts()
+        silent = counts.received > 0 and counts.rate < 0.2
+        level: Level = "error" if counts.error else "stale" if silent else "ok"
+        values: dict[str, object] = {"received": counts.received, "rate_hz": round(counts.rate, 2)}
+        values |= {f"dropped for {name}": n for name, n in counts.dropped.items()}
+        message = counts.error or (counts.notes[-1] if counts.notes else "frames come")
+        statuses = [Status("farside: camera", level, message, values)]
+        if self.recorder is not None:
+            r = self.recorder
+            recorded = {"frames": r.frames, "dropped": r.dropped, "bytes": r.bytes}
+            statuses.append(
+                Status("farside: recording", "error" if r.error else "ok", r.error or "recording", recorded)
+            )
+        self.announcer.status(list(self._scene.values()), statuses)
+
+    def tally(self) -> str:
+        """What was done, in one line."""
+        counts = self.reader.counts()
+        dropped = ", ".join(f"{n} dropped for {name}" for name, n in counts.dropped.items() if name != "newest")
+        text = f"{counts.received} frames, {self.frames} looked at, {self.inferences} inferred, {self.answered} answers"
+        text += f"; {dropped}" if dropped else ""
+        if self.recorder is not None:
+            text += f"; {self.recorder.path}: {self.recorder.frames} frames, {self.recorder.dropped} dropped"
+        return text

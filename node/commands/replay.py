@@ -1,0 +1,251 @@
+"""The main job: a source's frame, the objects in it, and for each one hypotheses, a short table and a picture."""
+
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from calibration.camera import Camera
+from calibration.camera_file import read_camera
+from node.figures.object_figure import draw_object
+from node.figures.summary import figures, warnings
+from perception.answers.hypotheses import Hypotheses
+from perception.answers.hypotheses_file import frame_path, hypotheses_path, load, save
+from perception.inference.controller import ControllerConfig, Estimate, estimate
+from perception.inference.tracker import TrackConfig
+from perception.observation.segmentation import Segment, SegmentConfig, segment
+from perception.sources.frame import Frame
+from perception.sources.frame_folder import write_frame_folder
+from perception.sources.open_source import SHIPPED_LOG
+from perception.sources.playback import open_playback
+from probnerf.inference import Method
+from probnerf.prior.checkpoint import Prior, load_prior
+from probnerf.sampling.hmc import StageInfo
+
+BUDGET_S = 90.0
+PICTURE_S = 3.0  # of each object's share of the budget, kept back for its picture
+
+
+@dataclass(frozen=True)
+class ReplayConfig:
+    """Keys of a configuration file such as launch/replay.yaml; the command's options have the same names."""
+
+    source: Path | None = None  # frame folder or recording; None: the one that ships with the project
+    object: int | None = None  # the one object to infer; None: all
+    out: Path | None = None  # None: out/<name of the source>
+    budget: float | None = None  # s for the whole job; None: 90, or no limit where `stages` is given
+    stages: int | None = None  # of the sampler, per object
+    seed: int = 0
+    method: Method | None = None  # None: that of `controller.infer`
+    frame: int = 0  # of a recording (of its range); -1 is the last
+    start_s: float = 0.0  # of a recording: --from and --to, s after its first frame
+    end_s: float | None = None
+    schedule: bool = False  # repeat the inferences that the recording tells of
+    camera: Path | None = None  # calibration in place of the source's intrinsics
+    prior: Path | None = None  # None: the one that ships with the project
+    colour_only: bool = False  # leave depth out
+    box: tuple[int, int, int, int] | None = None  # px, of a frame without depth; wins over segment.mask
+    segment: SegmentConfig = field(default_factory=SegmentConfig)
+    controller: ControllerConfig = field(default_factory=ControllerConfig)
+    track: TrackConfig = field(default_factory=TrackConfig)  # of a schedule
+
+    def __post_init__(self) -> None:
+        if self.budget is not None and not self.budget > 0:
+            raise ValueError(f"the budget is {self.budget:g} s; give more than 0")
+        if self.stages is not None and self.stages < 1:
+            raise ValueError(f"stages is {self.stages}; give 1 or more")
+        if not 0 <= self.seed < 1 << 32:
+            raise ValueError(f"the seed is {self.seed}; give 0 to {(1 << 32) - 1}")
+
+    @property
+    def inference(self) -> ControllerConfig:
+        """The controller's configuration with the method that was asked for."""
+        if self.method is None:
+            return self.controller
+        return replace(self.controller, infer=replace(self.controller.infer, method=self.method))
+
+    @property
+    def folder(self) -> Path:
+        """Where the results go."""
+        source = self.source or SHIPPED_LOG
+        return self.out or Path("out") / (source.stem if source.is_file() else source.resolve().name)
+
+
+def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
+    """Infer, save, picture and print the objects of one frame. False if Ctrl-C ended it; what is saved is whole.
+
+    An object that cannot be inferred is passed over with a note, unless it is the only one that was asked for. Raises
+    `ValueError` or `FileNotFoundError` in one line, before anything is written, for whatever the user can mend.
+    """
+    begun = time.monotonic()
+    if config.folder.exists() and not config.folder.is_dir():
+        raise ValueError(f"{config.folder} is a file; give a folder for the results with --out")
+    prior = load_prior(config.prior)
+    camera = None if config.camera is None else read_camera(config.camera)
+    frame = read_frame(config.source, config.frame, err, config.start_s, config.end_s, camera)
+    if config.colour_only:
+        frame = replace(frame, depth=None)
+    segmentation, source = _segmentation(frame, config), config.source or SHIPPED_LOG
+    try:
+        segments = segment(frame, config.object, segmentation)
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
+    limit = config.budget or (None if config.stages else BUDGET_S)
+    kept, done = frame_path(config.folder), list[Hypotheses]()
+    is_source = config.source is not None and config.source.resolve() == kept.resolve()
+    complaint = ValueError("no object")
+    for i, found in enumerate(segments):
+        share = None
+        if limit is not None:
+            share = (begun + limit - time.monotonic()) / (len(segments) - i) - PICTURE_S
+        try:
+            budget = None if share is None else max(share, 1.0)
+            result = infer(frame, found, prior, config.inference, err, config.seed, config.stages, budget)
+        except ValueError as error:
+            if len(segments) > 1:
+                err.print(f"object {found.id} is left out: {error}", highlight=False, soft_wrap=True)
+            complaint = ValueError(f"{source}: {error}")
+            continue
+        if not done and not is_source:
+            (kept / "meta.json").unlink(missing_ok=True)  # an earlier run's frame is not read beside this one's objects
+        path = publish(config.folder, frame, found, result.hypotheses, result.seconds, out)
+        for line in result.log:
+            out.print(f"  {line}", highlight=False, soft_wrap=True)
+        if not done:
+            _clear_others(config.folder, path, result.hypotheses if config.object is not None else None, out)
+            if not is_source:
+                write_frame_folder(kept, frame)
+        done.append(result.hypotheses)
+        if result.hypotheses.result == "interrupted":
+            return False
+    if not done:
+        raise complaint
+    return True
+
+
+def _segmentation(frame: Frame, config: ReplayConfig) -> SegmentConfig:
+    """How objects are found, with the box that was drawn. Raises `ValueError` where depth makes it idle."""
+    if config.box is None:
+        return config.segment
+    if frame.depth is not None:
+        raise ValueError("the frame has depth, which finds its objects: leave --box away, or add --colour-only")
+    return replace(config.segment, mask=replace(config.segment.mask, box_px=config.box))
+
+
+def read_frame(
+    source: Path | None,
+    index: int,
+    err: Console,
+    start_s: float = 0.0,
+    end_s: float | None = None,
+    camera: Camera | None = None,
+) -> Frame:
+    """Frame `index` (-1: the last) of a source, or of a recording's range, with `camera` in place of its own.
+
+    Its notes go to `err`. Raises ValueError where there is none.
+    """
+    opened = open_playback(source, start_s=start_s, end_s=end_s, camera=camera)
+    frame, count = None, 0
+    for count, frame in enumerate(opened, start=1):  # noqa: B007
+        if count == index + 1:
+            break
+    for note in opened.notes:
+        err.print(f"note: {note}", highlight=False, soft_wrap=True)
+    if frame is None:
+        raise ValueError(f"{source or SHIPPED_LOG} has no frame; record it again")
+    if index not in (-1, count - 1):
+        raise ValueError(
+            f"{source or SHIPPED_LOG} has {count} frames{' in this range' if start_s or end_s is not None else ''},"
+            f" no number {index}; give --frame 0 to {count - 1}"
+        )
+    return frame
+
+
+def infer(
+    frame: Frame,
+    found: Segment,
+    prior: Prior,
+    controller: ControllerConfig,
+    err: Console,
+    seed: int,
+    stages: int | None,
+    budget: float | None = None,
+) -> Estimate:
+    """One object's estimate, its progress shown."""
+    with progress_of(f"object {found.id}", stages, budget, err) as on_stage:
+        return estimate(frame, found, prior, controller, seed=seed, budget_s=budget, stages=stages, on_stage=on_stage)
+
+
+@contextmanager
+def progress_of(
+    name: str, stages: int | None, budget: float | None, err: Console
+) -> Iterator[Callable[[StageInfo], None]]:
+    """A line that tells the stage, how far the tempering is, and how the sampler moves."""
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=24), TimeElapsedColumn())
+    begun = time.monotonic()
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as progress:
+        task = progress.add_task(f"{name}: first, compiling" if budget is None or budget > 5 else name, total=1.0)
+
+        def on_stage(info: StageInfo) -> None:
+            beta, acceptance = min(info.beta), sum(info.acceptance) / len(info.acceptance)
+            parts = [0.0]
+            if stages is not None:
+                parts.append(info.stage / max(stages, 1))
+            if budget is not None:
+                parts.append((time.monotonic() - begun) / budget)
+            text = f"{name}: stage {info.stage}, temperature {1 / max(beta, 1e-9):.3g}, acceptance {acceptance:.2f}"
+            progress.update(task, description=text, completed=min(max(parts), 1.0))
+
+        yield on_stage
+
+
+def publish(folder: Path, frame: Frame, found: Segment, h: Hypotheses, seconds: float, out: Console) -> Path:
+    """Save, picture and print one object; the file's path."""
+    path = hypotheses_path(folder, h.object_id)
+    save(path, h)
+    picture = path.with_suffix(".png")
+    draw_object(picture, h, frame, found)
+    report(h, out, time=f"{seconds:.1f} s")
+    for written in (path, picture):
+        out.print(f"  {written}", highlight=False, soft_wrap=True)
+    return path
+
+
+def _clear_others(folder: Path, path: Path, same: Hypotheses | None, out: Console) -> None:
+    """Remove what earlier runs left beside `path`, for a folder's answer is joint over one frame: all objects, or with
+    `same` (one object of several was asked for) those of other frames.
+    """
+    for other in sorted(folder.glob("object_*.npz")):
+        if other == path or not re.fullmatch(r"object_\d+\.npz", other.name):
+            continue
+        if same is not None and _is_of_frame(other, same):
+            continue
+        other.unlink()
+        other.with_suffix(".png").unlink(missing_ok=True)
+        out.print(f"  {other} of an earlier run is removed", highlight=False, soft_wrap=True)
+
+
+def _is_of_frame(path: Path, h: Hypotheses) -> bool:
+    try:
+        other = load(path)
+    except ValueError:  # damaged, or of another version
+        return False
+    return (other.stamp_ns, other.frame_id) == (h.stamp_ns, h.frame_id)
+
+
+def report(h: Hypotheses, out: Console, **first: str) -> None:
+    """The short table of one object."""
+    table = Table.grid(padding=(0, 2))
+    for name, value in {**first, **figures(h)}.items():
+        table.add_row(f"  {name}", value)
+    label = f" ({h.label})" if h.label else ""
+    out.print(f"object {h.object_id}{label}", style="bold", highlight=False)
+    out.print(table, highlight=False)
+    for line in warnings(h):
+        out.print(f"  {line}", style="yellow", highlight=False, soft_wrap=True)

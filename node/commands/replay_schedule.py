@@ -1,0 +1,111 @@
+"""`farside replay --schedule`: the inferences of a recording again, and whether they came out as they did then."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from calibration.camera_file import read_camera
+from node.commands.replay import ReplayConfig, progress_of, publish
+from perception.inference.schedule import config_hash, digest
+from perception.inference.tracker import Look, Tracker
+from perception.observation.segmentation import Segment, segment
+from perception.sources.frame import Frame
+from perception.sources.open_source import SHIPPED_LOG
+from perception.sources.playback import Playback, open_playback
+from perception.sources.schedule_entry import Scheduled
+from probnerf.prior.checkpoint import Prior, load_prior
+
+
+def follow(config: ReplayConfig, out: Console, err: Console) -> bool:
+    """Infer what a recording's schedule says, frame by frame; False if Ctrl-C ended it.
+
+    Results go to `<folder>/<stamp>/object_<id>.npz` and are compared with what the schedule says came out. What went on
+    from an earlier frame goes on from its repeat. Raises ValueError in one line, before anything is written, where
+    there is no schedule to follow, or another prior or configuration.
+    """
+    path = config.source or SHIPPED_LOG
+    camera = None if config.camera is None else read_camera(config.camera)
+    playback = open_playback(config.source, 0.0, config.start_s, config.end_s, camera)
+    entries = playback.log.schedule() if isinstance(playback, Playback) else []
+    entries = [entry for entry in entries if config.object in (None, entry.object_id)]
+    if not entries:
+        whose = "" if config.object is None else f" for object {config.object}"
+        raise ValueError(f"{path} has no schedule{whose}; leave --schedule away")
+    prior = load_prior(config.prior)
+    _check(path, entries, prior, config)
+    by_stamp: dict[int, list[Scheduled]] = {}
+    for entry in entries:
+        by_stamp.setdefault(entry.stamp_ns, []).append(entry)
+    tracker = Tracker(prior, config.inference, config.track)
+    done = same = 0
+    stamps = []
+    for frame in playback:
+        stamps.append(frame.stamp_ns)
+        if not (asked := by_stamp.get(frame.stamp_ns)):
+            continue
+        looks = _looks(tracker, frame, asked, config, err)
+        for entry in asked:
+            if entry.object_id not in looks:
+                err.print(f"object {entry.object_id} is not in the frame at {frame.stamp_ns} ns", highlight=False)
+                continue
+            found, look = looks[entry.object_id]
+            with progress_of(f"object {entry.object_id}", entry.stages, None, err) as on_stage:
+                update = tracker.infer(look, stages=entry.stages, on_stage=on_stage)
+            folder = config.folder / str(frame.stamp_ns)
+            publish(folder, frame, found, update.hypotheses, update.seconds, out)
+            if update.hypotheses.result == "interrupted":
+                return False
+            done += 1
+            if digest(update.hypotheses) == entry.digest:
+                same += 1
+            else:
+                out.print("  differs from what came out when it was recorded", style="yellow", highlight=False)
+    lost = sum(stamps[0] <= stamp <= stamps[-1] and stamp not in stamps for stamp in by_stamp)
+    notes = list(playback.notes)
+    if lost:
+        notes.append(f"{lost} frames of the schedule are not in {path.name}")
+    for note in notes:
+        err.print(f"note: {note}", highlight=False, soft_wrap=True)
+    if not done:
+        raise ValueError(f"{path} has nothing in this range whose inference can be repeated; widen --from and --to")
+    out.print(f"{same} of {done} inferences came out as they did when they were recorded", highlight=False)
+    return True
+
+
+def _looks(
+    tracker: Tracker, frame: Frame, asked: Sequence[Scheduled], config: ReplayConfig, err: Console
+) -> dict[int, tuple[Segment, Look]]:
+    """The objects of a frame that the schedule tells of, by id."""
+    how = {entry.object_id: (entry.seed, entry.started_from == "fresh") for entry in asked}
+    looks = {}
+    try:
+        segments = segment(frame, None, config.segment)
+    except ValueError as error:
+        err.print(f"frame at {frame.stamp_ns} ns is left out: {error}", highlight=False, soft_wrap=True)
+        return {}
+    for found in segments:
+        try:
+            look = tracker.look(frame, found, how.get)
+        except ValueError as error:
+            err.print(f"object {found.id} is left out: {error}", highlight=False, soft_wrap=True)
+            continue
+        if look is not None:
+            looks[look.object_id] = (found, look)
+    return looks
+
+
+def _check(path: Path, entries: Sequence[Scheduled], prior: Prior, config: ReplayConfig) -> None:
+    """Raises ValueError where another prior or configuration was recorded."""
+    asked = config_hash(config.inference, config.segment)
+    for entry in entries:
+        if entry.prior_hash != prior.hash:
+            raise ValueError(
+                f"{path} was recorded with prior {entry.prior_hash}, and this one is {prior.hash}; give that one's file"
+                " with --prior"
+            )
+        if entry.config_hash != asked:
+            raise ValueError(
+                f"{path} was recorded with configuration {entry.config_hash}, and this one is {asked}; give that one"
+                " with --config and --method"
+            )

@@ -1,0 +1,83 @@
+"""`farside view --live`: the page of a node that runs somewhere else, from what it says on the bus."""
+
+import threading
+from collections import OrderedDict
+from typing import Any
+
+from rich.console import Console
+
+from node.ros.bus import Bus
+from node.ros.bus_config import BusConfig
+from node.ros.messages import HYPOTHESES, hypotheses_from
+from node.ros.topic_source import TopicConfig, TopicSource
+from node.viewer.scene3d import camera_view
+from perception.answers.hypotheses import Hypotheses
+from perception.sources.frame import Frame
+
+FRAMES = 300  # that are kept until their hypotheses come
+
+
+def watch(endpoint: str, node: str, port: int, out: Console, err: Console) -> None:
+    """Show what the node `node` (such as /farside) at `endpoint` says, until Ctrl-C.
+
+    Raises ValueError or OSError in one line: no endpoint, nobody there, or a port that is in use.
+    """
+    from node.viewer.page import Page  # viser takes a second to import
+
+    def say(text: str) -> None:
+        err.print(text, highlight=False, soft_wrap=True)
+
+    config = BusConfig(name="farside_view", connect=(endpoint,))
+    with Bus(config, say) as bus, Page(port) as page:
+        source = TopicSource(bus, camera_topics(node))
+        shown = Shown()
+        threading.Thread(target=shown.keep, args=(source,), daemon=True).start()
+        came = threading.Event()
+
+        def take(message: Any) -> None:
+            scene = shown.take(hypotheses_from(message))
+            frame = shown.frame(scene[0].stamp_ns)
+            page.show(scene, None if frame is None else camera_view(frame, scene))
+            came.set()
+
+        bus.subscribe(f"{node}/hypotheses", HYPOTHESES, take, depth=10)
+        out.print(f"{page.address} shows {node} at {endpoint}; Ctrl-C ends it", highlight=False, soft_wrap=True)
+        try:
+            if not came.wait(10.0):
+                say(f"nothing from {node} at {endpoint} yet; is it running, and has it seen an object?")
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            source.close()
+
+
+def camera_topics(node: str) -> TopicConfig:
+    """Where a node tells what its camera saw."""
+    names = (f"{node}/color/image_raw", f"{node}/depth/image_raw", f"{node}/color/camera_info")
+    return TopicConfig(*names)
+
+
+class Shown:
+    """The objects of the newest scene, and the frames that hypotheses may yet come for."""
+
+    def __init__(self) -> None:
+        self._scene: dict[int, Hypotheses] = {}
+        self._frames: OrderedDict[int, Frame] = OrderedDict()
+
+    def keep(self, source: TopicSource) -> None:
+        """Take frames until the source ends."""
+        for frame in source:
+            self._frames[frame.stamp_ns] = frame
+            while len(self._frames) > FRAMES:
+                self._frames.popitem(last=False)
+
+    def frame(self, stamp_ns: int) -> Frame | None:
+        """The frame of this stamp, if it came."""
+        return self._frames.get(stamp_ns)
+
+    def take(self, h: Hypotheses) -> list[Hypotheses]:
+        """The scene with one object's new hypotheses: all objects of that frame."""
+        others = {name: o for name, o in self._scene.items() if (o.stamp_ns, o.frame_id) == (h.stamp_ns, h.frame_id)}
+        self._scene = others | {h.object_id: h}
+        return list(self._scene.values())

@@ -1,0 +1,188 @@
+"""Solid voxel grids as shaded pictures, by marching rays in NumPy. Cube units, view frame (`probnerf.types`).
+
+A viewpoint looks at the cube's centre; pictures are square. Symbols: G voxels per axis, s pixels per side.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from calibration.camera import Camera
+from perception.answers.hypotheses import Hypotheses
+from perception.observation.rays import ObjectFrame
+from probnerf.geometry import look_at, pinhole_rays
+from probnerf.types import BASE_Z, FREE, OBJECT, UNKNOWN
+
+RADIUS = 1.15  # a picture shows this much around the cube's centre
+SEEN, UNSEEN = np.array([0.62, 0.70, 0.78]), np.array([0.95, 0.60, 0.28])  # paint of surface the camera saw, or not
+STATUS = {OBJECT: ("object", "#2ca02c"), FREE: ("free", "#4f8fd0"), UNKNOWN: ("unknown", "#303030")}  # of a pixel
+_GROUND = np.array([0.93, 0.93, 0.92])
+_HIGHEST = np.deg2rad(35.0)  # elevation from which the far side is shown
+_STEP = 0.75  # voxels
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """A square picture's rays."""
+
+    T_cube_camera: Float[np.ndarray, "4 4"]
+    directions: Float[np.ndarray, "n 3"]  # unit, row by row
+    size: int
+
+    @property
+    def origin(self) -> Float[np.ndarray, "3"]:
+        """The camera's place."""
+        return self.T_cube_camera[:3, 3]
+
+
+def viewpoint(frame: ObjectFrame, size: int, behind: bool = False) -> Viewpoint:
+    """The camera's own viewpoint, turned to the cube's centre; or the opposite one, from at most 35 degrees above."""
+    position = frame.to_cube(np.zeros(3))
+    distance = float(np.linalg.norm(position))
+    if behind:
+        elevation = min(float(np.arcsin(position[2] / distance)), _HIGHEST)
+        away = -position[:2] / max(float(np.linalg.norm(position[:2])), 1e-9)
+        position = distance * np.array([*(np.cos(elevation) * away), np.sin(elevation)])
+    T = look_at(position, np.zeros(3))
+    _, directions = pinhole_rays(T, 0.5 * size * distance / RADIUS, size)
+    return Viewpoint(T, directions.astype(np.float64), size)
+
+
+def look_up(image: np.ndarray, camera: Camera, frame: ObjectFrame, view: Viewpoint, outside: float) -> np.ndarray:
+    """What a frame's picture (or map) shows along the viewpoint's rays: a crop, turned to the cube's centre.
+
+    Only for a viewpoint at the camera's own place, where a turn moves no parallax. `outside` fills what is beyond the
+    picture.
+    """
+    rays = view.directions @ frame.T_camera_object[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = np.nan_to_num(np.round(camera.project(rays)), nan=-1.0)
+    inside = (rays[:, 2] > 0) & ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+    u, v = np.where(inside[:, None], pixels, 0).astype(int).T
+    found = np.where(inside.reshape(-1, *[1] * (image.ndim - 2)), image[v, u], outside)
+    return found.reshape(view.size, view.size, *image.shape[2:])
+
+
+def shade(
+    h: Hypotheses, solid: Bool[np.ndarray, "G G G"], view: Viewpoint, base: float = BASE_Z
+) -> Float[np.ndarray, "s s 3"]:
+    """A shape on the plane at height `base`, lit from above left; grey where the camera saw it, orange elsewhere."""
+    rgb = np.ones((len(view.directions), 3))
+    ground = _meet_ground(view, base)
+    with np.errstate(invalid="ignore"):
+        on_ground = view.origin + ground[:, None] * view.directions
+    lit = np.isfinite(ground) & (np.abs(on_ground[:, :2]) < 1.0).all(axis=1)
+    low = np.asarray(solid[:, :, : int(0.3 * solid.shape[2])].any(axis=2), np.float32)
+    for _ in range(3):
+        low = _blurred(low)
+    rgb[lit] = _GROUND * (1.0 - 0.35 * _nearest(low, *on_ground[lit][:, :2].T))[:, None]
+    t, normals = march(solid, view)
+    hit = np.isfinite(t) & ~(ground < t - 0.03)
+    points = view.origin + t[hit, None] * view.directions[hit]
+    # Was the space in front of the surface seen? The surface itself is within the noise of depth.
+    seen = _nearest(h.seen, *(points + 2.5 / solid.shape[0] * normals[hit]).T)
+    paint = np.where(seen[:, None], SEEN, UNSEEN)
+    T = view.T_cube_camera
+    light = T[:3, :3] @ np.array([-0.5, -0.7, -0.6])  # to the left, up, towards the viewer
+    light = light / np.linalg.norm(light)
+    facing = np.clip(normals[hit] @ light, 0.0, 1.0)
+    rim = np.clip(-np.einsum("ij,ij->i", normals[hit], view.directions[hit]), 0.0, 1.0)
+    rgb[hit] = paint * (0.42 + 0.5 * facing + 0.18 * rim)[:, None]
+    return np.clip(rgb, 0.0, 1.0).reshape(view.size, view.size, 3)
+
+
+def march(solid: Bool[np.ndarray, "G G G"], view: Viewpoint) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+    """Distance to the first surface along each ray (inf: none) and its outward unit normal."""
+    t_hit, normals = np.full(len(view.directions), np.inf), np.zeros((len(view.directions), 3))
+    if not solid.any():
+        return t_hit, normals
+    grid = solid.shape[0]
+    field = _blurred(solid.astype(np.float32))
+    occupied = np.argwhere(solid)
+    low, high = -1.0 + (occupied.min(axis=0) - 1) * 2.0 / grid, -1.0 + (occupied.max(axis=0) + 2) * 2.0 / grid
+    near, far = _box(view, low, high)
+    crosses = np.flatnonzero(far > near)
+    step = _STEP * 2.0 / grid
+    t = near[crosses, None] + step * np.arange(int(np.ceil((far - near)[crosses].max() / step)) + 1)
+    inside, core = np.zeros(t.shape, bool), field >= 0.5
+    origin, directions = view.origin.astype(np.float32), view.directions.astype(np.float32)
+    for rows in np.array_split(np.arange(len(crosses)), max(1, t.size // 500_000)):
+        at = t[rows].astype(np.float32)
+        inside[rows] = _nearest(
+            core, *(at * d[:, None] + o for o, d in zip(origin, directions[crosses[rows]].T, strict=True))
+        )
+    first = inside.argmax(axis=1)
+    rows = np.flatnonzero(inside.any(axis=1))
+    chosen, after = crosses[rows], t[rows, first[rows]]
+    before, after = after - 1.5 * step, after + 0.5 * step
+    for _ in range(6):  # bisection, on the field between voxel centres
+        middle = 0.5 * (before + after)
+        beyond = _trilinear(field, view.origin + middle[:, None] * view.directions[chosen]) >= 0.5
+        before, after = np.where(beyond, before, middle), np.where(beyond, middle, after)
+    t_hit[chosen] = after
+    soft = _blurred(_blurred(field))
+    points = view.origin + after[:, None] * view.directions[chosen]
+    gradient = np.stack([_trilinear(g, points) for g in np.gradient(soft)], axis=-1)
+    length = np.linalg.norm(gradient, axis=1, keepdims=True)
+    normals[chosen] = np.where(length > 1e-6, -gradient / np.maximum(length, 1e-6), -view.directions[chosen])
+    return t_hit, normals
+
+
+def largest_along(values: Float[np.ndarray, "G G G"], view: Viewpoint) -> Float[np.ndarray, "s s"]:
+    """The largest value that each ray meets in the cube (0 where it meets none)."""
+    near, far = _box(view, np.full(3, -1.0), np.full(3, 1.0))
+    step = 2.0 / values.shape[0]
+    out = np.zeros(len(near))
+    crosses = np.flatnonzero(far > near)
+    for rows in np.array_split(crosses, max(1, len(crosses) // 8000)):
+        t = near[rows, None] + step * np.arange(int(np.ceil((far - near)[rows].max() / step)) + 1)
+        at = (o + t * d[:, None] for o, d in zip(view.origin, view.directions[rows].T, strict=True))
+        out[rows] = _nearest(values, *at).max(axis=1)
+    return out.reshape(view.size, view.size)
+
+
+def _meet_ground(view: Viewpoint, base: float) -> Float[np.ndarray, "n"]:
+    with np.errstate(divide="ignore"):
+        t = (base - view.origin[2]) / view.directions[:, 2]
+    return np.where(t > 0, t, np.inf)
+
+
+def _box(
+    view: Viewpoint, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Where each ray enters and leaves a box; enters after it leaves where it misses."""
+    d = np.where(np.abs(view.directions) < 1e-9, 1e-9, view.directions)
+    a, b = (low - view.origin) / d, (high - view.origin) / d
+    return np.maximum(np.minimum(a, b).max(axis=1), 0.0), np.maximum(a, b).min(axis=1)
+
+
+def _blurred(field: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """[1 2 1] / 4 along every axis; outside is 0."""
+    for axis in range(field.ndim):
+        wide = np.pad(field, [(1, 1) if a == axis else (0, 0) for a in range(field.ndim)])
+        wide = np.moveaxis(wide, axis, 0)
+        field = np.moveaxis(0.25 * wide[:-2] + 0.5 * wide[1:-1] + 0.25 * wide[2:], 0, axis)
+    return field
+
+
+def _nearest(values: np.ndarray, *coordinates: Float[np.ndarray, "..."]) -> np.ndarray:
+    """The voxel's value at points of the cube (or square) given by their coordinates; zero outside."""
+    grid = values.shape[0]
+    index = np.zeros((), np.int32)
+    for p in coordinates:  # into a copy with a border of zeros, which clipping leads to
+        index = index * (grid + 2) + np.clip((p + 1.0) * (0.5 * grid) + 1.0, 0, grid + 1).astype(np.int32)
+    return np.pad(values, 1).ravel()[index]
+
+
+def _trilinear(values: Float[np.ndarray, "G G G"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Interpolation between voxel centres; the border's value outside them."""
+    grid = values.shape[0]
+    at = np.clip((points + 1.0) * (0.5 * grid) - 0.5, 0.0, grid - 1.001)
+    i = at.astype(np.int32)
+    f = at - i
+    total = np.zeros(len(points))
+    for corner in np.ndindex(2, 2, 2):
+        weight = np.prod(np.where(corner, f, 1.0 - f), axis=1)
+        total += weight * values[tuple((i + corner).T)]
+    return total

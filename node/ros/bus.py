@@ -1,0 +1,308 @@
+"""The bus: topics and services of ROS 2 on Zenoh, in the format of `rmw_zenoh_cpp` (`rmw_zenoh.py`), without ROS.
+
+Closed by default: it listens on this machine alone, finds nobody by multicast, and connects where it is told to.
+Whatever comes in is bounded in size, rate and number waiting; what is wrong is counted, said once, and passed over.
+"""
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Self
+
+import zenoh
+import zenoh.ext
+
+from node.ros.bus_config import BusConfig
+from node.ros.message_counts import Counts, Rate
+from node.ros.messages import decode, encode, make, type_hash
+from node.ros.rmw_zenoh import Node, attachment, gid, key, quality, read_attachment
+
+_HEARTBEAT_S = 0.5  # by which a late joiner notices that it missed a latched sample; as rmw_zenoh_cpp has it
+_SENDERS = 256  # whose sequence numbers are remembered
+
+
+@dataclass
+class Publisher:
+    """One topic to write to."""
+
+    name: str  # full
+    kind: str
+    latched: bool
+    _publisher: Any
+    _source: bytes
+    _counts: Counts
+    _rate: Rate
+    _max_bytes: int
+    _sequence: int = 0
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @property
+    def wanted(self) -> bool:
+        """Whether somebody listens, or may later want the last message."""
+        return self.latched or bool(self._publisher.matching_status.matching)
+
+    def publish(self, message: Any) -> bool:
+        """Send a message to whoever listens now; it never waits for them. False where it was not sent (see Counts).
+
+        Raises ValueError where the message is of another type, or a field does not fit it.
+        """
+        if message.__msgtype__ != self.kind:
+            raise ValueError(f"{self.name} carries {self.kind}, not {message.__msgtype__}")
+        if not self._rate.allows():
+            self._counts.add(self.name, "too_fast", "messages are published faster than max_rate; some are left out")
+            return False
+        data = encode(message)
+        if len(data) > self._max_bytes:
+            trouble = (
+                f"a message of {len(data)} bytes is larger than max_message_bytes ({self._max_bytes}); it is left out"
+            )
+            self._counts.add(self.name, "too_large", trouble)
+            return False
+        with self._lock:  # numbers leave in order
+            self._sequence += 1
+            try:
+                self._publisher.put(data, attachment=attachment(self._sequence, time.time_ns(), self._source))
+            except zenoh.ZError as error:
+                self._counts.add(self.name, "failed", _line(error))
+                return False
+        self._counts.add(self.name, "sent")
+        return True
+
+
+class Bus:
+    """A node on the bus: `with Bus(config) as bus: ...`. Names are ROS names: ~/own, relative, or /absolute.
+
+    Raises OSError where an endpoint cannot be used, FileNotFoundError for a certificate that is not there.
+    """
+
+    def __init__(self, config: BusConfig | None = None, say: Callable[[str], None] | None = None) -> None:
+        self.config = config or BusConfig()
+        self.counts = Counts(say or (lambda line: print(f"farside: {line}", file=sys.stderr)))
+        self._entities = 0
+        self._tokens: list[str] = []  # our own, which a router does not tell us
+        self._threads: list[threading.Thread] = []
+        self._clients: dict[tuple[str, str], bytes] = {}
+        self._sequence = 0
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> Self:
+        c = self.config
+        with ExitStack() as stack:
+            self._session = stack.enter_context(_open(c))
+            self.node = Node(c.domain_id, str(self._session.zid()), c.namespace, c.name)
+            self._stack = stack.pop_all()
+        self._declare(self.node.token(0, "NN"))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()  # ends the loops of the threads, too
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(5.0)
+
+    def publisher(self, name: str, kind: str, *, latched: bool = False, depth: int = 1) -> Publisher:
+        """A topic to write to. `latched` (TRANSIENT_LOCAL): who joins late gets the last `depth` messages."""
+        name, where, source = self._entity("MP", name, kind, quality(depth, latched))
+        drop = zenoh.CongestionControl.DROP  # rather than wait for a slow subscriber
+        if latched:
+            publisher: Any = zenoh.ext.declare_advanced_publisher(
+                self._session,
+                where,
+                congestion_control=drop,
+                cache=zenoh.ext.CacheConfig(depth),
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
+                publisher_detection=True,
+            )
+        else:
+            publisher = self._session.declare_publisher(where, congestion_control=drop)
+        self._stack.callback(publisher.undeclare)
+        c = self.config
+        return Publisher(name, kind, latched, publisher, source, self.counts, Rate(c.max_rate), c.max_message_bytes)
+
+    def subscribe(
+        self, name: str, kind: str, handler: Callable[[Any], object], *, latched: bool = False, depth: int = 5
+    ) -> str:
+        """Call `handler` with each message, in a thread of this subscription's own; gives the full name.
+
+        While it works, the newest `depth` messages wait and older ones are dropped. `latched`: the last ones that were
+        sent before come first.
+        """
+        name, where, _ = self._entity("MS", name, kind, quality(depth, latched))
+        ring: Any = zenoh.handlers.RingChannel(depth)
+        if latched:
+            subscriber: Any = zenoh.ext.declare_advanced_subscriber(
+                self._session,
+                where,
+                ring,
+                history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=depth),
+                recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+                subscriber_detection=True,
+            )
+        else:
+            subscriber = self._session.declare_subscriber(where, ring)
+
+        def take(sample: Any, _: tuple[int, bytes]) -> None:
+            handler(decode(sample.payload.to_bytes(), kind))
+
+        self._run(name, subscriber, take)
+        return name
+
+    def serve(self, name: str, kind: str, handler: Callable[[Any], Any], *, depth: int = 10) -> str:
+        """Answer a service's requests with `handler`, one at a time in a thread of its own; gives the full name.
+
+        What it raises is answered with success = false and the error's line as message, where the response has these.
+        """
+        name, where, _ = self._entity("SS", name, kind, quality(depth))
+        queryable = self._session.declare_queryable(where, zenoh.handlers.RingChannel(depth), complete=True)
+
+        def answer(query: Any, tag: tuple[int, bytes], response: Any) -> None:
+            data = encode(response)
+            if len(data) > self.config.max_message_bytes:
+                raise ValueError(f"the answer has {len(data)} bytes, more than max_message_bytes allows; ask for less")
+            query.reply(where, data, attachment=attachment(tag[0], time.time_ns(), tag[1]))
+            self.counts.add(name, "sent")
+
+        def take(query: Any, tag: tuple[int, bytes]) -> None:
+            request = decode(query.payload.to_bytes() if query.payload is not None else b"", f"{kind}_Request")
+            answer(query, tag, handler(request))
+
+        def refuse(query: Any, trouble: str) -> None:
+            try:
+                answer(query, _tag(query), make(f"{kind}_Response", success=False, message=trouble))
+            except ValueError:  # its response has no such fields, or the query no sender
+                query.reply_err(trouble.encode())
+
+        self._run(name, queryable, take, refuse)
+        return name
+
+    def call(self, name: str, kind: str, request: Any, timeout_s: float = 5.0) -> Any:
+        """Ask a service and wait for its answer; until it is there to answer, the request is sent again.
+
+        Raises TimeoutError where nobody answers in time, OSError where the service refuses.
+        """
+        name = self.node.resolve(name)
+        with self._lock:
+            if (name, kind) not in self._clients:
+                self._clients[name, kind] = self._entity("SC", name, kind, quality(10))[2]
+            source = self._clients[name, kind]
+            self._sequence += 1
+            sequence = self._sequence
+        where = key(self.config.domain_id, name, kind, type_hash(kind))
+        data, deadline = encode(request), time.monotonic() + timeout_s
+        while (left := deadline - time.monotonic()) > 0:
+            replies: Any = self._session.get(
+                where,
+                zenoh.handlers.FifoChannel(4),
+                target=zenoh.QueryTarget.ALL_COMPLETE,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                payload=data,
+                attachment=attachment(sequence, time.time_ns(), source),
+                timeout=left,
+            )
+            for reply in replies:
+                if reply.ok is not None:
+                    return decode(reply.ok.payload.to_bytes(), f"{kind}_Response")
+                if (said := reply.err.payload.to_string()) != "Timeout":
+                    raise OSError(f"{name} refused: {said}")
+            time.sleep(min(0.05, max(0.0, left)))
+        raise TimeoutError(
+            f"{name} ({kind}) did not answer in {timeout_s:g} s; is its node up, on this domain and router?"
+        )
+
+    def graph(self, timeout_s: float = 1.0) -> list[str]:
+        """The liveliness tokens of all nodes on this domain and of what they publish, take and serve."""
+        replies: Any = self._session.liveliness().get(f"@ros2_lv/{self.config.domain_id}/**", timeout=timeout_s)
+        return sorted({*self._tokens, *(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)})
+
+    def _declare(self, token: str) -> None:
+        self._stack.enter_context(self._session.liveliness().declare_token(token))
+        self._tokens.append(token)
+
+    def _entity(self, code: str, name: str, kind: str, qos: str) -> tuple[str, str, bytes]:
+        """Announce a publisher, subscriber, service or client: its full name, key and gid."""
+        name, hashed = self.node.resolve(name), type_hash(kind)
+        self._entities += 1
+        token = self.node.token(self._entities, code, name, kind, hashed, qos)
+        self._declare(token)
+        return name, key(self.config.domain_id, name, kind, hashed), gid(token)
+
+    def _run(self, name: str, source: Any, take: Callable, refuse: Callable | None = None) -> None:
+        """Take what comes from `source` in a thread, until it is undeclared; `refuse` answers a query that is wrong."""
+        rate, last, c = Rate(self.config.max_rate), dict[bytes, int](), self.config
+        setting, limit = (
+            ("max_request_bytes", c.max_request_bytes) if refuse else ("max_message_bytes", c.max_message_bytes)
+        )
+
+        def judge(item: Any) -> tuple[str, str]:
+            """What became of one item, and the trouble with it."""
+            try:
+                sequence, sender = tag = _tag(item)
+                if lost := max(0, sequence - last.get(sender, sequence) - 1):
+                    self.counts.add(name, "dropped", count=lost)
+                if len(last) > _SENDERS:
+                    last.clear()
+                last[sender] = max(sequence, last.get(sender, sequence))
+                size = len(item.payload) if item.payload is not None else 0
+                if size > limit:
+                    return "too_large", f"a message of {size} bytes is larger than {setting} ({limit})"
+                if not rate.allows():
+                    return "too_fast", f"messages come faster than max_rate ({self.config.max_rate:g} Hz)"
+                take(item, tag)
+            except ValueError as error:
+                return "refused" if refuse else "malformed", _line(error)
+            except Exception as error:  # a handler's fault must not end the service
+                return "failed", f"{type(error).__name__}: {_line(error)}"
+            return "received", ""
+
+        def loop() -> None:
+            for item in source:
+                fate, trouble = judge(item)
+                self.counts.add(name, fate, trouble)
+                if refuse:
+                    try:
+                        if trouble:
+                            refuse(item, trouble)
+                        item.drop()  # now, not when it is collected: the asker waits for the end of answers
+                    except zenoh.ZError as error:  # who asked has gone
+                        self.counts.add(name, "failed", _line(error))
+
+        thread = threading.Thread(target=loop, name=f"bus {name}", daemon=True)
+        thread.start()
+        self._stack.callback(source.undeclare)
+        self._threads.append(thread)
+
+
+def _open(config: BusConfig) -> zenoh.Session:
+    """Raises OSError naming the endpoint that cannot be used."""
+    settings = json.dumps(config.settings())
+    try:
+        return zenoh.open(zenoh.Config.from_json5(settings))
+    except zenoh.ZError as error:
+        text = str(error)
+        for endpoint in (*config.listen, *config.connect):
+            if "Address already in use" in text and endpoint in text:
+                raise OSError(
+                    f"the bus cannot listen on {endpoint}: another program does; end it, or set another port in listen"
+                ) from None
+        reason = text.split(" at /")[0].strip()
+        listen, connect = ", ".join(config.listen) or "nothing", ", ".join(config.connect) or "nothing"
+        raise OSError(f"the bus cannot open (listen {listen}; connect {connect}): {' '.join(reason.split())}") from None
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _tag(item: Any) -> tuple[int, bytes]:
+    """Number and sender of a sample or query. Raises ValueError where it carries none."""
+    if item.attachment is None:
+        raise ValueError("a message has no attachment; its sender does not speak as rmw_zenoh_cpp does")
+    sequence, _, sender = read_attachment(item.attachment.to_bytes())
+    return sequence, sender

@@ -1,0 +1,74 @@
+"""What the node tells the bus of each scene: the topics that a planner, a person and ROS 2's tools look at."""
+
+import time
+from collections.abc import Callable, Sequence
+
+from calibration.camera import Camera
+from node.ros.bus import Bus, Publisher
+from node.ros.messages import HYPOTHESES, frame_messages, hypotheses_message
+from node.ros.scene_messages import (
+    Status,
+    counts_status,
+    diagnostics_message,
+    markers_message,
+    occupancy_message,
+    sampler_status,
+    transforms_message,
+    uncertainty_message,
+)
+from perception.answers.hypotheses import Hypotheses
+from perception.sources.frame import Frame
+
+_CAMERA = {"color/image_raw": "Image", "color/camera_info": "CameraInfo", "depth/image_raw": "Image"}
+LATCHED = 8  # objects of which a late joiner gets the hypotheses
+
+
+class Announcer:
+    """Publishes ~/hypotheses (latched), ~/occupancy, ~/markers, ~/uncertainty, /diagnostics, /tf, and the camera's
+    ~/color/image_raw, ~/color/camera_info and ~/depth/image_raw. What nobody listens to is not computed.
+    """
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._node = bus.node.resolve("~/object").removesuffix("/object")
+        self._hypotheses = bus.publisher("~/hypotheses", HYPOTHESES, latched=True, depth=LATCHED)
+        self._occupancy = bus.publisher("~/occupancy", "sensor_msgs/msg/PointCloud2")
+        self._markers = bus.publisher("~/markers", "visualization_msgs/msg/MarkerArray")
+        self._uncertainty = bus.publisher("~/uncertainty", "sensor_msgs/msg/Image")
+        self._diagnostics = bus.publisher("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+        images = {name: f"sensor_msgs/msg/{kind}" for name, kind in _CAMERA.items()}
+        self._camera = {name: bus.publisher(f"~/{name}", kind) for name, kind in images.items()}
+        self._tf = bus.publisher("/tf", "tf2_msgs/msg/TFMessage", depth=100)
+
+    @property
+    def node(self) -> str:
+        """The node's full name, such as /farside, which its objects' frames begin with."""
+        return self._node
+
+    def frame(self, frame: Frame) -> None:
+        """Publish what the camera saw, as a driver would."""
+        if any(publisher.wanted for publisher in self._camera.values()):
+            for name, message in frame_messages(frame).items():
+                self._camera[name].publish(message)
+
+    def scene(self, objects: Sequence[Hypotheses], camera: Camera, method: str = "") -> None:
+        """Publish all that there is to say of one scene. `camera` is that of the picture."""
+        for h in objects:
+            self._hypotheses.publish(hypotheses_message(h, method))
+        if not objects:
+            return
+        self._tf.publish(transforms_message(objects, self._node))
+        views: list[tuple[Publisher, Callable[[], object]]] = [
+            (self._occupancy, lambda: occupancy_message(objects)),
+            (self._markers, lambda: markers_message(objects)),
+            (self._uncertainty, lambda: uncertainty_message(objects, camera)),
+        ]
+        for publisher, build in views:
+            if publisher.wanted:
+                publisher.publish(build())
+
+    def status(self, objects: Sequence[Hypotheses], others: Sequence[Status] = ()) -> None:
+        """Publish /diagnostics: the sampler's word on each object, the bus's counts, and `others` (camera, rates)."""
+        now = time.time_ns()
+        statuses = [*others, *(sampler_status(h, now) for h in objects), counts_status(self._bus.counts.all())]
+        self._diagnostics.publish(diagnostics_message(now, statuses))

@@ -1,0 +1,226 @@
+"""What the page shows, computed: places, meshes, clouds and answers, in metres in one frame, the page's.
+
+The page's frame is the world where all objects know it, else the frame of the only object, else that of the first one.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from node.figures import voxel_renderer
+from perception.answers.hypotheses import FrameName, Hypotheses, binary_entropy, by_weight, mesh
+from perception.answers.query import QueryResult, query
+from perception.answers.regions import Box, Points
+from perception.observation.segmentation import Segment, backproject, segment
+from perception.sources.frame import Frame
+from probnerf.rendering.occupancy import voxel_centres
+from probnerf.types import BASE_Z
+
+AROUND = 2.2  # half extents of its cube: so much of the scene is shown around each object
+MAX_POINTS = 60_000  # of the seen surface
+BOX_EDGES = np.array(  # of the unit cube about the origin: [12 edges, 2 ends, 3]
+    [
+        [np.roll([x, y, z], axis) for z in (-0.5, 0.5)]
+        for axis in range(3)
+        for x, y in ((-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5))
+    ]
+)
+LEAST_P = 0.02  # less probable voxels are not shown at all
+
+
+@dataclass(frozen=True, eq=False)
+class CameraView:
+    """The frame that a scene was inferred from, and what its pixels say of each object (by id)."""
+
+    frame: Frame
+    segments: Mapping[int, Segment]
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A scene in the page's frame, ready to be asked in it."""
+
+    objects: tuple[Hypotheses, ...]
+    frame: FrameName  # the name of the page's frame in questions to `objects`
+    title: str  # that frame in words
+    T_page_camera: Float[np.ndarray, "4 4"]
+
+    def T_page_object(self, h: Hypotheses) -> Float[np.ndarray, "4 4"]:
+        """p_page = T_page_object @ p_object, metres."""
+        return np.linalg.inv(h.T_object_from(self.frame))
+
+    @property
+    def distance(self) -> float:
+        """From the camera to the first object (m)."""
+        return float(np.linalg.norm(self.objects[0].object_frame.T_camera_object[:3, 3]))
+
+    @property
+    def up(self) -> Float[np.ndarray, "3"]:
+        """The first support plane's normal."""
+        return self.T_page_object(self.objects[0])[:3, 2]
+
+
+def camera_view(frame: Frame, scene: Sequence[Hypotheses]) -> CameraView:
+    """A frame with the statuses of its pixels for the scene's objects, computed anew with the usual segmentation.
+
+    Raises ValueError where the frame is not the scene's.
+    """
+    for h in scene:
+        if (h.stamp_ns, h.frame_id) != (frame.stamp_ns, frame.frame_id):
+            raise ValueError(
+                f"the frame beside it is '{frame.frame_id}' at {frame.stamp_ns} ns, but object {h.object_id} is of "
+                f"'{h.frame_id}' at {h.stamp_ns} ns"
+            )
+    ids = {h.object_id for h in scene}
+    return CameraView(frame, {found.id: found for found in segment(frame) if found.id in ids})
+
+
+def place(scene: Sequence[Hypotheses]) -> Placed:
+    """The scene in the page's frame. Raises ValueError for an empty scene, or objects of different frames."""
+    if not scene:
+        raise ValueError("there is no object to show; give at least one object's hypotheses")
+    first = scene[0]
+    T_object_camera = np.linalg.inv(first.object_frame.T_camera_object)
+    if all(h.T_world_camera is not None for h in scene):
+        placed = Placed(tuple(scene), "world", "world", np.asarray(first.T_world_camera))
+    elif len(scene) == 1:
+        placed = Placed((first,), "object", f"object {first.object_id}", T_object_camera)
+    else:  # the first object's frame is made the world, because only there may several objects be asked at once
+        moved = tuple(replace(h, T_world_camera=T_object_camera) for h in scene)
+        placed = Placed(moved, "world", f"object {first.object_id}", T_object_camera)
+    ask(placed, np.zeros(3), np.full(3, 1e-3))  # raises where the objects do not go together
+    return placed
+
+
+def ask(placed: Placed, centre: Float[np.ndarray, "3"], size: Float[np.ndarray, "3"]) -> QueryResult:
+    """What all objects together say of an axis-aligned box of the page's frame (m)."""
+    centre, size = np.asarray(centre, np.float64), np.asarray(size, np.float64)
+    low, high = (tuple(float(v) for v in centre + side * size) for side in (-0.5, 0.5))
+    return query(placed.objects, Box(low, high), placed.frame)  # type: ignore[arg-type]
+
+
+def transform(T: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+    """T @ p of points."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """One hypothesis' surface in the page's frame, parted by whether the camera saw it."""
+
+    vertices: Float[np.ndarray, "v 3"]  # m
+    seen: Int[np.ndarray, "a 3"]  # triangles
+    unseen: Int[np.ndarray, "b 3"]
+
+
+def weights_in_order(h: Hypotheses) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Distinct hypotheses from the heaviest on: their indices and weights (those of identical ones added)."""
+    order = by_weight(h)
+    return order, np.bincount(h.twins, weights=h.weights, minlength=len(h.weights))[order]
+
+
+def shape(placed: Placed, h: Hypotheses, index: int) -> Shape:
+    """The surface of hypothesis `index`. A triangle is seen where space just in front of it was."""
+    vertices, faces = mesh(h, index)
+    corners = vertices[faces]  # [f, 3, 3]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    # The surface itself is within the noise of depth: look two and a half half-voxels out, as the pictures do.
+    front = corners.mean(axis=1) + 2.5 * h.object_frame.half_extent / h.grid * normals
+    voxel = h.voxels("object", *front.T)
+    seen = (voxel < 0) | h.seen.ravel()[voxel]
+    return Shape(transform(placed.T_page_object(h), vertices), faces[seen], faces[~seen])
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Space above the plane that no pixel has seen, a point for each voxel that may be occupied."""
+
+    points: Float[np.ndarray, "n 3"]  # m
+    p_occupied: Float[np.ndarray, "n"]  # by `query`: of all objects together
+    voxel_m: float
+
+    @property
+    def disagreement(self) -> Float[np.ndarray, "n"]:
+        """Binary entropy of `p_occupied`, in shares of log 2: 1 where the hypotheses are evenly split."""
+        return binary_entropy(self.p_occupied) / np.log(2.0)
+
+
+def cloud(placed: Placed) -> Cloud:
+    """The unseen space of all objects."""
+    points = []
+    for h in placed.objects:
+        cube = voxel_centres(h.grid).astype(np.float64)
+        hidden = cube[~h.seen & (cube[..., 2] >= BASE_Z)]
+        points.append(transform(placed.T_page_object(h), hidden * h.object_frame.half_extent))
+    where = np.concatenate(points)
+    p = np.asarray(query(placed.objects, Points(where), placed.frame).p_occupied) if len(where) else np.zeros(0)
+    keep = p >= LEAST_P
+    return Cloud(where[keep], p[keep], min(h.voxel_m for h in placed.objects))
+
+
+def first_box(placed: Placed, unseen: Cloud) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Centre and size (m) of a box where the answer is worth reading: the surroundings of space that hypotheses are
+    split about, at about even odds. Rounded to millimetres.
+    """
+    side = 0.3 * placed.objects[0].object_frame.half_extent
+    size = np.maximum(np.round(np.full(3, side), 3), 1e-3)
+    if not len(unseen.points):
+        return np.round(placed.T_page_object(placed.objects[0])[:3, 3], 3), size
+    split = unseen.points[unseen.disagreement >= 0.5 * unseen.disagreement.max()]
+    tried = np.round(split[:: max(1, len(split) // 40)], 3)
+    answers = [ask(placed, point, size) for point in tried]
+    best = min(range(len(tried)), key=lambda i: (answers[i].outside_fraction > 0, abs(answers[i].p_free - 0.5)))
+    return tried[best], size
+
+
+def seen_surface(placed: Placed, view: CameraView) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    """The points that the depth measured around the objects (m), with their colours."""
+    points = backproject(view.frame)
+    near = np.zeros(points.shape[:2], bool)
+    for h in placed.objects:
+        with np.errstate(invalid="ignore"):
+            near |= (np.abs(h.object_frame.to_cube(points)) < AROUND).all(axis=-1)
+    chosen = np.flatnonzero(near)
+    chosen = chosen[:: max(1, len(chosen) // MAX_POINTS)]
+    return transform(placed.T_page_camera, points.reshape(-1, 3)[chosen]), view.frame.rgb.reshape(-1, 3)[chosen]
+
+
+def picture(view: CameraView, object_id: int, tinted: bool) -> UInt8[np.ndarray, "h w 3"]:
+    """The frame's colours, or over them in grey what each pixel says of the object (`shade.STATUS`)."""
+    found = view.segments.get(object_id)
+    if not tinted or found is None:
+        return view.frame.rgb
+    paint = np.zeros(view.frame.rgb.shape)
+    for value, (_, colour) in voxel_renderer.STATUS.items():
+        paint[found.status == value] = tuple(bytes.fromhex(colour[1:]))
+    return np.round(0.5 * view.frame.rgb.mean(axis=2, keepdims=True) + 0.5 * paint).astype(np.uint8)
+
+
+def field_of_view(frame: Frame) -> tuple[float, float]:
+    """Vertical field of view (rad) and width over height, of the pinhole without its distortion."""
+    height, width = frame.rgb.shape[:2]
+    fy, fx = frame.camera.K[1, 1], frame.camera.K[0, 0]
+    return float(2.0 * np.arctan(0.5 * height / fy)), float(width / fx / (height / fy))
+
+
+def onlooker(placed: Placed) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Where to look from and at (m): beside the objects and a little behind, so that both sides are in sight."""
+    frames = [placed.T_page_object(h) for h in placed.objects]
+    middle = np.mean([T[:3, 3] for T in frames], axis=0)
+    reach = max(
+        float(np.linalg.norm(T[:3, 3] - middle)) + h.object_frame.half_extent
+        for T, h in zip(frames, placed.objects, strict=True)
+    )
+    x, y, z = frames[0][:3, :3].T  # x to the camera
+    return middle + reach * (-1.0 * x - 3.6 * y + 2.1 * z), middle + reach * (0.4 * x + 0.15 * z)
+
+
+def colours(values: Float[np.ndarray, "n"], ramp: Sequence[str]) -> UInt8[np.ndarray, "n 3"]:
+    """Values 0 to 1 along a ramp of hexadecimal colours."""
+    stops = np.array([tuple(bytes.fromhex(colour[1:])) for colour in ramp], np.float64)
+    at = np.clip(values, 0.0, 1.0) * (len(stops) - 1)
+    channels = [np.interp(at, np.arange(len(stops)), stop) for stop in stops.T]
+    return np.round(np.stack(channels, axis=-1)).astype(np.uint8)

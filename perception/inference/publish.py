@@ -1,0 +1,150 @@
+"""A posterior as planners read it: from samples to Hypotheses."""
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool
+
+from perception.answers.hypotheses import Hypotheses
+from perception.observation.rays import ObjectFrame
+from perception.observation.segmentation import Segment
+from perception.observation.visibility import answered_voxels
+from perception.sources.frame import Frame
+from probnerf.inference import without_sizes
+from probnerf.likelihood.settings import Likelihood
+from probnerf.prior.checkpoint import Prior
+from probnerf.sampling.populations import thin
+from probnerf.shapes import explained, opacity_grids, poses, scaled_about
+from probnerf.types import BASE_Z, Observation, Posterior
+
+
+@dataclass(frozen=True)
+class PublishConfig:
+    """How finely an answer is given."""
+
+    hypotheses: int = 48  # shapes published
+    grid: int = 64  # voxels per axis, G
+    out_of_model_below: float = 0.90  # share of telling pixels explained on average; validation objects: 0.91 and more
+
+    def __post_init__(self) -> None:
+        if self.hypotheses < 1:
+            raise ValueError(f"hypotheses is {self.hypotheses}; give 1 or more")
+        if not 1 <= self.grid <= 512:
+            raise ValueError(f"grid is {self.grid}; give 1 to 512")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What is conditioned on, and the frame that the answer is given in: the newest one."""
+
+    frame: Frame
+    segment: Segment
+    observation: Observation  # of this frame, or of several joined
+    object_frame: ObjectFrame  # in this frame's camera
+    seen: Bool[np.ndarray, "g g g"]  # by any frame
+
+
+def published(
+    view: View,
+    posterior: Posterior,
+    likelihood: Likelihood,
+    prior: Prior,
+    config: PublishConfig,
+    seed: int,
+    diagnostics: dict[str, float],
+) -> Hypotheses:
+    """A posterior as planners read it; `diagnostics` are added to the sampler's own."""
+    chosen, weights, population = thin(posterior, config.hypotheses)
+    sizeless = without_sizes(likelihood)
+    # NumPy: how many there are to choose from varies, and nothing may compile for it
+    positions, pose_sigma = jax.device_put(np.asarray(posterior.positions)[chosen]), view.observation.pose_sigma
+    fit = float(weights @ np.asarray(explained(prior.model, sizeless, view.observation, positions), np.float64))
+    cube = view.object_frame
+    if cube.sight_sigma > 0.0:  # what no pixel tells is not sampled: each sample draws it from its prior
+        key = jax.random.fold_in(jax.random.key(seed), 1)
+        drawn = cube.sight_sigma * jax.random.normal(key, posterior.log_weights.shape)
+        camera = jnp.asarray(cube.to_cube(np.zeros(3)), jnp.float32)
+        positions = scaled_about(prior.model, positions, pose_sigma, camera, drawn[jnp.asarray(chosen)])
+    asked = answered_voxels(view.frame, view.segment, cube, config.grid)
+    opacity = opacity_grids(prior.model, sizeless, positions, pose_sigma, jax.device_put(asked))
+    pose = poses(prior.model, sizeless, positions, pose_sigma)
+    d = posterior.diagnostics
+    draft = Hypotheses(
+        stamp_ns=view.frame.stamp_ns,
+        frame_id=view.frame.frame_id,
+        object_id=view.segment.id,
+        label="",
+        object_frame=view.object_frame,
+        T_world_camera=view.frame.T_world_camera,
+        opacity=np.asarray(opacity),
+        pose=np.stack([np.asarray(a) for a in (pose.yaw, pose.x, pose.y, pose.log_scale, pose.z)], axis=-1),
+        weights=weights,
+        population=population,
+        seen=view.seen,
+        inside_view=_inside_picture(view.segment),
+        out_of_model=fit < config.out_of_model_below,
+        stage=int(d.stages),
+        monte_carlo_error=0.0,
+        prior_hash=prior.hash,
+        seed=seed,
+        diagnostics={
+            "acceptance": float(d.acceptance),
+            "divergences": float(d.divergences),
+            "r_hat": float(d.r_hat),
+            "ess": float(d.ess),
+            "ancestors": float(d.ancestors),
+            "beta": float(np.min(np.asarray(d.beta))),
+            "log_evidence": float(posterior.log_evidence),
+            "log_evidence_se": float(posterior.log_evidence_se),
+            "explained": fit,
+            "failed_populations": float(len(np.unique(posterior.population)) - len(np.unique(population))),
+            "power": likelihood.power,
+            **diagnostics,
+        },
+        result=posterior.result,
+    )
+    return _with_error(draft)
+
+
+def _with_error(h: Hypotheses) -> Hypotheses:
+    """Fill in the standard error of the mean occupancy of unseen voxels above the plane, and `expected_loss` there."""
+    z = -1.0 + (np.arange(h.grid) + 0.5) * 2.0 / h.grid
+    hidden = ~h.seen & (z > BASE_Z)
+    # one shape at a time: to index them all at once would stop every other thread for a fifth of a second
+    count = np.array([np.count_nonzero(shape & hidden) for shape in h.solid])
+    return replace(
+        h,
+        monte_carlo_error=float(h.estimate(count / max(hidden.sum(), 1))[1]),
+        diagnostics={**h.diagnostics, "expected_loss": expected_loss(h, hidden)},
+    )
+
+
+def expected_loss(h: Hypotheses, region: Bool[np.ndarray, "G G G"]) -> float:
+    """Log score that the answer is expected to lose, nats a voxel of a region, for it has so few populations.
+
+    With independent estimates p_m of a voxel's probability, m = 1 .. M, of mean p and variance s^2, their mean's log
+    score lies s^2 / M / (2 p (1 - p)) below that of p, to second order, if p is right: so much more of them would
+    gain, and it falls with 1 / M. All populations that have weight count alike. Each is known by the shapes of it that
+    are published; the fewer, the more is lost. NaN where there are no two populations.
+    """
+    names = np.unique(h.population[h.weights > 0.0])
+    if len(names) < 2:
+        return float("nan")
+    total, squares = np.zeros(h.seen.shape, np.float32), np.zeros(h.seen.shape, np.float32)
+    for name in names:  # one shape at a time, as above
+        own, weight = np.zeros_like(total), h.weights[h.population == name].sum()
+        for i in np.flatnonzero(h.population == name):
+            own += np.float32(h.weights[i] / weight) * h.solid[i]
+        total += own
+        squares += np.square(own)
+    p = total[region] / len(names)
+    variance = np.maximum(squares[region] / len(names) - np.square(p), 0.0) / (len(names) - 1)
+    open_to = (p > 0.0) & (p < 1.0)
+    return float((variance[open_to] / (2.0 * p[open_to] * (1.0 - p[open_to]))).sum() / max(region.sum(), 1))
+
+
+def _inside_picture(segment: Segment) -> bool:
+    border = np.concatenate([segment.mask[0], segment.mask[-1], segment.mask[:, 0], segment.mask[:, -1]])
+    return not bool(border.any())

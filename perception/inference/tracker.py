@@ -1,0 +1,266 @@
+"""Objects over time: each frame adds to what is known of them, or says that they moved.
+
+The latents live in the cube of an object's first frame. A later frame of the same still object is observed in that cube
+(its camera moves, its rays with it), and the posterior of all views is inferred afresh: what is left of the one before
+knows fewer modes than a new search finds. What a frame adds is measured by the voxels that it is the first to see. One
+that adds nothing shares its errors with those before it, as pictures from one tripod do: it only has to agree, and the
+answer is published again under its stamp, or gone on with where it was cut short (`populations.start_from`). A frame
+that the hypotheses do not explain shows an object that moved.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from perception.answers.hypotheses import Hypotheses
+from perception.inference.controller import ControllerConfig, infer_view
+from perception.inference.publish import View
+from perception.observation.rays import ObjectFrame, object_frame, observe
+from perception.observation.segmentation import Segment
+from perception.observation.visibility import seen_voxels
+from perception.sources.frame import Frame
+from probnerf.inference import likelihood_of, without_sizes
+from probnerf.prior.checkpoint import Prior
+from probnerf.rendering.occupancy import voxel_centres
+from probnerf.sampling.hmc import StageInfo
+from probnerf.sampling.populations import thin
+from probnerf.shapes import explained
+from probnerf.types import BASE_Z, Observation, Posterior, joined, on_device
+
+Change = Literal["new", "view", "continued", "same", "moved"]
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """When a frame counts as a further view of an object, and when as another place of it."""
+
+    views: int = 3  # kept of each object; a further one takes the place of the nearest
+    apart: float = 15.0  # degrees between the directions of two views; one from nearer by takes the other's place
+    adds: float = 0.08  # share of the unseen space above the plane that a frame must see first; noise sees 0.01 to 0.03
+    checked: int = 32  # hypotheses that a frame is held against: the best of them counts
+    moved_below: float = 0.8  # share of telling pixels explained by the best of them under which the object has moved
+    reach: float = 0.6  # half extents; without a label map the object nearer than this is the same one
+    plane_degrees: float = 2.0  # without T_world_camera the camera stands still while its plane does, to so much
+    plane_m: float = 0.01
+    objects: int = 16  # remembered; of more, those inferred longest ago are forgotten
+
+    def __post_init__(self) -> None:
+        if min(self.views, self.checked) < 1:
+            raise ValueError(f"views {self.views} and checked {self.checked} must be 1 or more")
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """What one frame did to what is known of one object."""
+
+    change: Change  # first seen; a view added; sampling gone on; nothing to add; moved, so started again
+    hypotheses: Hypotheses
+    stages: int  # of the sampler, spent on this frame
+    agreement: float  # share explained of the frame's telling pixels by the hypothesis that explains most (NaN: new)
+    seconds: float  # of sampling
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """One view that the posterior is conditioned on."""
+
+    observation: Observation
+    direction: Float[np.ndarray, "3"]  # from the cube's centre to the camera, unit
+
+
+@dataclass(frozen=True, eq=False)
+class _Track:
+    """What is known of one object."""
+
+    anchor: ObjectFrame  # in the first frame's camera
+    first: Frame
+    kept: tuple[_Kept, ...]
+    seen: Bool[np.ndarray, "g g g"]
+    posterior: Posterior
+    hypotheses: Hypotheses
+    inferences: int  # so far
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What a first look at a frame's segment tells, before any sampling."""
+
+    object_id: int  # the object's own, which stays from frame to frame
+    change: Change
+    agreement: float
+    hypotheses: Hypotheses | None  # what is known of it already, under this frame's stamp; None: nothing that holds
+    seed: int
+    _view: View  # to condition on
+    _kept: tuple[_Kept, ...]
+    _track: _Track | None  # that is gone on from
+
+    @property
+    def settled(self) -> bool:
+        """There is nothing to infer."""
+        return self.change == "same"
+
+
+@dataclass
+class Tracker:
+    """The objects of a scene from frame to frame. Deterministic where `stages` is given and no deadline."""
+
+    prior: Prior
+    config: ControllerConfig = field(default_factory=ControllerConfig)
+    track: TrackConfig = field(default_factory=TrackConfig)
+    seed: int = 0
+    _tracks: dict[int, _Track] = field(default_factory=dict)
+    _names: set[int] = field(default_factory=set)  # that were given
+
+    def update(self, frame: Frame, segment: Segment, **limits: Any) -> Update:
+        """Take a frame's segment into account: `look`, and `infer` where there is something to infer."""
+        look = self.look(frame, segment)
+        assert look is not None
+        return self.infer(look, **limits)
+
+    def look(
+        self, frame: Frame, segment: Segment, how: Callable[[int], tuple[int, bool] | None] | None = None
+    ) -> Look | None:
+        """Hold a frame's segment against what is known.
+
+        `how` maps the object's id to the seed of what is drawn for this frame and whether to begin anew; where it
+        answers None, so does this. Without it the seed is the tracker's own and the number of the inference. Raises
+        ValueError where the segment cannot be observed, as `observe` does.
+        """
+        found = object_frame(frame, segment, self.config.observe)
+        name = self._name(frame, segment, found)
+        track = self._tracks.get(name)
+        chosen = (self.seed + (0 if track is None else track.inferences), False) if how is None else how(name)
+        if chosen is None:
+            return None
+        seed, fresh = chosen
+        segment = replace(segment, id=name)
+        change: Change = "new"
+        agreement = float("nan")
+        if track is not None and not fresh:
+            cube = track.anchor.seen_from(_moved_by(track.first, frame))
+            observation, _ = observe(frame, segment, self.config.observe, seed, cube)
+            agreement = self._agreement(track.posterior, observation)
+            still = frame.T_world_camera is not None or _same_plane(cube.plane, found.plane, self.track)
+            if still and agreement >= self.track.moved_below:
+                return self._go_on(name, track, View(frame, segment, observation, cube, track.seen), agreement, seed)
+            change = "moved"
+        observation, _ = observe(frame, segment, self.config.observe, seed, found)
+        view = View(frame, segment, observation, found, seen_voxels(frame, segment, found, self.config.grid))
+        return Look(name, change, agreement, None, seed, view, (_Kept(observation, _direction(found)),), None)
+
+    def infer(
+        self,
+        look: Look,
+        *,
+        deadline: float | None = None,
+        stages: int | None = None,
+        on_stage: Callable[[StageInfo], bool | None] | None = None,
+        on_answer: Callable[[Hypotheses], None] | None = None,
+    ) -> Update:
+        """Sample what a look left to be inferred, and keep it. The limits are `infer_view`'s."""
+        track = look._track
+        if look.settled and track is not None and look.hypotheses is not None:
+            self._tracks[look.object_id] = replace(track, hypotheses=look.hypotheses)
+            return Update(look.change, look.hypotheses, 0, look.agreement, 0.0)
+        before = None
+        if look.change == "continued" and track is not None:
+            estimates = np.asarray(track.posterior.diagnostics.log_evidences)
+            before = track.posterior if np.isfinite(estimates).all() else None
+        result = infer_view(
+            look._view,
+            self.prior,
+            self.config,
+            seed=look.seed,
+            before=before,
+            fresh=look.hypotheses is None,
+            deadline=deadline,
+            stages=stages,
+            on_stage=on_stage,
+            on_answer=on_answer,
+        )
+        self._tracks[look.object_id] = _Track(
+            anchor=look._view.object_frame if track is None else track.anchor,
+            first=look._view.frame if track is None else track.first,
+            kept=look._kept,
+            seen=look._view.seen,
+            posterior=result.posterior,
+            hypotheses=result.hypotheses,
+            inferences=1 + (0 if track is None else track.inferences),
+        )
+        self._tracks[look.object_id] = self._tracks.pop(look.object_id)  # the last seen is the last
+        for name in list(self._tracks)[: -self.track.objects]:
+            del self._tracks[name]
+        return Update(look.change, result.hypotheses, result.hypotheses.stage, look.agreement, result.seconds)
+
+    def _name(self, frame: Frame, segment: Segment, found: ObjectFrame) -> int:
+        """The id of the object that a segment shows: by its label, or else by its place; a new one for a new object."""
+        if frame.label is not None:
+            return segment.id
+        distances = {}
+        for name, track in self._tracks.items():
+            cube = track.anchor.seen_from(_moved_by(track.first, frame))
+            apart = float(np.linalg.norm(cube.T_camera_object[:3, 3] - found.T_camera_object[:3, 3]))
+            distances[name] = apart / (self.track.reach * cube.half_extent)
+        best = min(distances, key=lambda name: distances[name], default=None)
+        if best is not None and distances[best] < 1.0:
+            return best
+        name = max(self._names) + 1 if segment.id in self._names else segment.id
+        self._names.add(name)
+        return name
+
+    def _go_on(self, name: int, track: _Track, view: View, agreement: float, seed: int) -> Look:
+        """The look at an object that stands where it stood."""
+        seen = seen_voxels(view.frame, view.segment, view.object_frame, self.config.grid)
+        hidden = (voxel_centres(self.config.grid)[..., 2] >= BASE_Z) & ~track.seen
+        adds = float((hidden & seen).sum()) / max(int(hidden.sum()), 1) >= self.track.adds
+        kept = track.kept
+        change: Change = "same" if track.posterior.result == "converged" else "continued"
+        if adds:
+            kept = _with_view(kept, _Kept(view.observation, _direction(view.object_frame)), self.track)
+            change = "view"
+        h = replace(
+            track.hypotheses,
+            stamp_ns=view.frame.stamp_ns,
+            frame_id=view.frame.frame_id,
+            object_frame=view.object_frame,
+            T_world_camera=view.frame.T_world_camera,
+        )
+        view = replace(view, observation=joined([k.observation for k in kept]), seen=track.seen | seen)
+        return Look(name, change, agreement, h, seed, view, kept, track)
+
+    def _agreement(self, posterior: Posterior, observation: Observation) -> float:
+        """The largest share of the telling pixels that one of a few samples explains."""
+        chosen, _, _ = thin(posterior, self.track.checked)
+        likelihood = without_sizes(likelihood_of(self.config.infer, observation))
+        positions = on_device(np.asarray(posterior.positions)[chosen])
+        shares = explained(self.prior.model, likelihood, observation, positions)
+        return float(np.max(np.asarray(shares)))
+
+
+def _moved_by(first: Frame, now: Frame) -> Float[np.ndarray, "4 4"]:
+    """T_now_first between the cameras of two frames: the identity where either does not know its place."""
+    if first.T_world_camera is None or now.T_world_camera is None:
+        return np.eye(4)
+    return np.linalg.inv(now.T_world_camera) @ first.T_world_camera
+
+
+def _same_plane(a: Float[np.ndarray, "4"], b: Float[np.ndarray, "4"], config: TrackConfig) -> bool:
+    turned = np.degrees(np.arccos(np.clip(a[:3] @ b[:3], -1.0, 1.0)))
+    return bool(turned <= config.plane_degrees and abs(a[3] - b[3]) <= config.plane_m)
+
+
+def _direction(cube: ObjectFrame) -> Float[np.ndarray, "3"]:
+    at = cube.to_cube(np.zeros(3))
+    return at / np.linalg.norm(at)
+
+
+def _with_view(kept: tuple[_Kept, ...], new: _Kept, config: TrackConfig) -> tuple[_Kept, ...]:
+    """The views with a further one: in place of the nearest where that is near, or where there are enough."""
+    cosine = [float(k.direction @ new.direction) for k in kept]
+    nearest = int(np.argmax(cosine))
+    if len(kept) >= config.views or cosine[nearest] > np.cos(np.radians(config.apart)):
+        kept = kept[:nearest] + kept[nearest + 1 :]
+    return (*kept, new)

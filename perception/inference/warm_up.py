@@ -1,0 +1,69 @@
+"""Before a camera is opened: compile what its first frame would wait for, and keep the garbage collector short."""
+
+import gc
+from dataclasses import replace
+
+import jax
+import numpy as np
+
+from perception.inference.tracker import Look, Tracker
+from perception.observation.segmentation import Segment, segment
+from perception.sources.frame import Frame
+from perception.sources.open_source import SHIPPED_LOG
+from perception.sources.recording import Log
+from probnerf.compile_cache import rehearsal
+from probnerf.inference import infer
+from probnerf.types import FREE, UNKNOWN, Posterior
+
+
+def warm_up(tracker: Tracker) -> None:
+    """Look at an object of the shipped recording with a tracker of the same prior and configuration: as if nothing
+    stood before it, for which inference climbs, and half hidden, as it is there, for which it begins at the prior. It
+    is a rehearsal: programs that are kept (`probnerf.compile_cache`) are read, or compiled, and not run.
+
+    Raises KeyboardInterrupt where Ctrl-C ended it, which the sampler may keep for itself.
+
+    A full garbage collection stops every thread. Over what JAX keeps of its programs it takes 0.1 to 0.3 s, several
+    periods of a camera, so what is there by then is set aside from it.
+    """
+    frame = next(iter(Log(SHIPPED_LOG)))
+    hidden = segment(frame)[0]
+    trial = replace(tracker, _tracks={}, _names=set())
+    with rehearsal():
+        try:
+            look = trial.look(frame, _alone(hidden))
+        except ValueError:  # a prior of other objects: its own first frame compiles
+            look = None
+        if look is not None:
+            _infer_twice(trial, look, frame, hidden)
+    gc.collect()
+    gc.freeze()
+
+
+def _infer_twice(trial: Tracker, look: Look, frame: Frame, hidden: Segment) -> None:
+    """The object alone, again where that was cut short, and half hidden."""
+    update = trial.infer(look, stages=1, on_answer=lambda _: None)
+    if update.hypotheses.result == "interrupted":
+        raise KeyboardInterrupt
+    again = trial.look(frame, _alone(hidden))
+    assert again is not None
+    _sampled(trial, again, trial._tracks[again.object_id].posterior)  # what a next frame asks
+    anew = trial.look(frame, hidden, lambda _: (0, True))
+    assert anew is not None  # to publish it needs nothing new
+    _sampled(trial, anew, _sampled(trial, anew, None))
+
+
+def _sampled(trial: Tracker, look: Look, before: Posterior | None) -> Posterior:
+    """One stage, from an answer that was cut short or from the prior."""
+    observation = look._view.observation
+    key, config = jax.random.key(0), trial.config.infer
+    posterior, _ = infer(key, trial.prior.model, observation, config, before=before, stages=1)
+    if posterior.result == "interrupted":
+        raise KeyboardInterrupt
+    return posterior
+
+
+def _alone(segment: Segment) -> Segment:
+    """The segment as if all that was hidden of its surroundings had been seen empty."""
+    status = np.where(segment.status == UNKNOWN, FREE, segment.status).astype(segment.status.dtype)
+    return replace(segment, status=status, occluder=np.zeros_like(segment.occluder))

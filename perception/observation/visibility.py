@@ -1,0 +1,66 @@
+"""Which part of an object's cube the camera saw."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from calibration.camera import Camera
+from perception.observation.rays import ObjectFrame
+from perception.observation.segmentation import Segment
+from perception.observation.without_depth import plane_depth
+from perception.sources.frame import Frame
+from probnerf.types import BASE_Z
+
+
+def seen_voxels(
+    frame: Frame, segment: Segment, cube: ObjectFrame, grid: int = 64
+) -> Bool[np.ndarray, "grid grid grid"]:
+    """Voxels [i_x, i_y, i_z] of the cube that the camera saw: free before the measured end of their ray, or at it.
+
+    "At it": the centre is at most half a voxel's diagonal behind the surface. Not seen: outside the picture, no depth.
+    In a frame without any depth a ray ends on the supposed plane where its pixel is FREE of the object; the rays of
+    other pixels may end anywhere, so that nothing on them is seen, not even before the object.
+    """
+    half_diagonal = np.sqrt(3.0) / grid * cube.half_extent
+    return _behind_the_end(frame, segment, cube, grid) <= half_diagonal
+
+
+def answered_voxels(
+    frame: Frame, segment: Segment, cube: ObjectFrame, grid: int = 64
+) -> Bool[np.ndarray, "grid grid grid"]:
+    """Voxels that shapes need to be asked of: all but those at least two voxels before a measured end and two voxels
+    from any that are not. That space is free whatever a shape says.
+    """
+    rest = ~(_behind_the_end(frame, segment, cube, grid) <= -4.0 / grid * cube.half_extent)
+    z = -1.0 + (np.arange(grid) + 0.5) * 2.0 / grid
+    return rest | ndimage.binary_dilation(rest & (z > BASE_Z), iterations=2)
+
+
+def _behind_the_end(
+    frame: Frame, segment: Segment, cube: ObjectFrame, grid: int
+) -> Float[np.ndarray, "grid grid grid"]:
+    """How far each voxel's centre lies behind the end of its ray, m; NaN where that is not known."""
+    points, pixels, inside = _voxels(frame.camera, cube, grid)
+    depth = plane_depth(frame.camera, cube.plane, segment.status) if frame.depth is None else frame.depth
+    z = depth[pixels[:, 1], pixels[:, 0]]
+    distance = np.linalg.norm(points, axis=1)
+    with np.errstate(invalid="ignore"):
+        behind = np.where(inside, distance * (1.0 - z / points[:, 2]), np.nan)
+    return behind.reshape(grid, grid, grid)
+
+
+def inside_view(camera: Camera, cube: ObjectFrame, grid: int = 64) -> Bool[np.ndarray, "grid grid grid"]:
+    """Voxels [i_x, i_y, i_z] of the cube whose centre falls inside the picture."""
+    return _voxels(camera, cube, grid)[2].reshape(grid, grid, grid)
+
+
+def _voxels(
+    camera: Camera, cube: ObjectFrame, grid: int
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
+    """Voxel centres in the camera frame (m), the pixel each falls in (clipped), and whether that is in the picture."""
+    ticks = -1.0 + (np.arange(grid) + 0.5) * 2.0 / grid
+    points = cube.to_camera(np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3))
+    px = np.round(np.nan_to_num(camera.project(points), nan=-1.0))
+    size = np.array([camera.width, camera.height])
+    inside = ((px >= 0) & (px < size)).all(axis=1)
+    return points, np.clip(px, 0, size - 1).astype(np.intp), inside

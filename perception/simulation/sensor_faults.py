@@ -1,0 +1,107 @@
+"""What a depth camera makes of a faultless picture: noise, holes, flying pixels, quantised depth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from calibration.camera import Camera
+from perception.simulation.simulated_camera import _SUB, Picture, Scene, render
+from perception.sources.frame import Frame
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """Faults of an active stereo camera. z is the depth of a pixel in metres."""
+
+    noise: float = 0.001  # m: the standard deviation of depth is noise + noise_z2 z^2
+    noise_z2: float = 0.002  # 1/m
+    noise_width: float = 0.6  # px: neighbours' noise is alike this far
+    quantum: float = 0.001  # m: depth comes in whole steps
+    max_range: float = 4.0  # m: nothing beyond
+    baseline: float = 0.05  # m between the two eyes: what only one of them sees has no depth
+    grazing: float = 80.0  # degrees between ray and normal beyond which depth begins to fail
+    edge: float = 0.01  # m of depth within a pixel that make it a mixed one
+    flying: float = 0.3  # share of the mixed pixels that report a depth in between; the others report none
+    blobs: float = 3e-5  # holes per pixel
+    blob_radius: float = 2.0  # px, median
+    colour_noise: float = 0.006  # of [0, 1]
+
+
+def simulate(
+    scene: Scene,
+    camera: Camera,
+    T_world_camera: Float[np.ndarray, "4 4"],
+    seed: int,
+    config: SensorConfig | None = None,
+    stamp_ns: int = 0,
+) -> Frame:
+    """One frame of a scene with the sensor's faults and the true label map; a function of its arguments alone."""
+    return sense(render(scene, camera, T_world_camera), camera, T_world_camera, seed, config, stamp_ns)
+
+
+def sense(
+    picture: Picture,
+    camera: Camera,
+    T_world_camera: Float[np.ndarray, "4 4"] | None,
+    seed: int,
+    config: SensorConfig | None = None,
+    stamp_ns: int = 0,
+) -> Frame:
+    """The frame that a faulty sensor makes of a picture."""
+    config = config or SensorConfig()
+    rng = np.random.default_rng([seed, 5])
+    shape = picture.depth.shape
+    with np.errstate(invalid="ignore"):
+        spread = picture.farthest - picture.nearest  # m; NaN where there is nothing at all
+    # Mixed pixels: in between, or nothing.
+    mixed = ~(spread < config.edge)
+    between = picture.nearest + rng.random(shape) * np.where(np.isfinite(spread), spread, 0.0)
+    z = np.where(mixed, between, picture.depth)
+    lost = mixed & (rng.random(shape) > config.flying)
+    # Grazing: neighbouring rays, z / (2 f) apart across the view, differ in depth by tan(angle) times that.
+    slope = np.where(mixed, 0.0, spread) / (z / camera.K[0, 0] / _SUB)
+    lost |= rng.random(shape) < np.clip(slope / np.tan(np.deg2rad(config.grazing)) - 1.0, 0.0, 1.0)
+    # Seen by the left eye alone: something to the right stands before it in the right eye's picture.
+    column = np.arange(shape[1]) - camera.K[0, 0] * config.baseline / picture.depth
+    rightwards = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
+    lost[:, :-1] |= column[:, :-1] > rightwards[:, 1:] + 1.0
+    lost |= _blobs(rng, shape, config)
+    with np.errstate(invalid="ignore"):  # where there is nothing, z is infinite, and lost below
+        z = z + (config.noise + config.noise_z2 * z**2) * _noise(rng, shape, config.noise_width)
+    z = np.rint(z / config.quantum) * config.quantum
+    lost |= ~(z > 0) | (z > config.max_range)
+    gain = 1.0 + 0.01 * rng.standard_normal()
+    rgb = gain * picture.rgb + config.colour_noise * rng.standard_normal((*shape, 3))
+    return Frame(
+        stamp_ns=stamp_ns,
+        frame_id="camera_color_optical_frame",
+        rgb=np.rint(255.0 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8),
+        depth=np.where(lost, np.nan, z).astype(np.float32),
+        label=picture.label,
+        camera=camera,
+        T_world_camera=T_world_camera,
+    )
+
+
+def _noise(rng: np.random.Generator, shape: tuple[int, ...], width: float) -> Float[np.ndarray, "h w"]:
+    """Gaussian noise of unit variance, smoothed over `width` pixels."""
+    impulse = np.zeros((33, 33))
+    impulse[16, 16] = 1.0
+    gain = np.linalg.norm(ndimage.gaussian_filter(impulse, width))
+    return ndimage.gaussian_filter(rng.standard_normal(shape), width) / gain
+
+
+def _blobs(rng: np.random.Generator, shape: tuple[int, ...], config: SensorConfig) -> Bool[np.ndarray, "h w"]:
+    """Round holes at random."""
+    lost = np.zeros(shape, bool)
+    for _ in range(rng.poisson(config.blobs * lost.size)):
+        row, column = rng.uniform(0, shape[0]), rng.uniform(0, shape[1])
+        radius = config.blob_radius * np.exp(0.5 * rng.standard_normal())
+        low = np.maximum(np.array([row, column]) - radius, 0).astype(int)
+        high = np.minimum(np.array([row, column]) + radius + 1, shape).astype(int)
+        window = np.s_[low[0] : high[0], low[1] : high[1]]
+        y, x = np.mgrid[window]
+        lost[window] |= (y - row) ** 2 + (x - column) ** 2 < radius**2
+    return lost

@@ -1,0 +1,177 @@
+"""The frame folder: color.png, depth.png, label.png and meta.json, read and written."""
+
+import json
+import os
+import zlib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Shaped, UInt8
+
+from calibration.camera import Camera
+from perception.sources.frame import Frame
+from probnerf.geometry import rigid
+
+DEPTH_UNIT_M = 1e-4  # of the depth.png that is written; 1 mm where that does not reach far enough
+_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+
+
+def read_frame_folder(path: Path | str) -> Frame:
+    """The frame in a folder: color.png, meta.json, and depth.png (16 bit, 0 for unknown) and label.png where they are.
+
+    meta.json gives `camera_matrix_px` (3x3) and `depth_unit_m` (m per count), and may give `distortion` and
+    `distortion_model` (as `Camera`; none by default), `stamp_ns` (0), `frame_id` ("camera") and `T_world_camera` (4x4,
+    m); whatever else it holds is not read. With neither depth.png nor depth_unit_m it is a frame without depth. Raises
+    `FileNotFoundError` or `ValueError` naming the file and the remedy.
+    """
+    path = Path(path)
+    meta = _read_meta(path / "meta.json", depth=(path / "depth.png").exists())
+    unit = meta.get("depth_unit_m")
+    colour = read_png(path / "color.png")
+    if colour.dtype != np.uint8:
+        raise ValueError(f"{path / 'color.png'} has {colour.dtype} samples; save it with 8 bits a channel")
+    rgb = colour_to_rgb(colour)
+    height, width = rgb.shape[:2]
+    counts = None if unit is None else read_png(path / "depth.png")
+    if counts is not None and (counts.dtype != np.uint16 or counts.ndim != 2):
+        raise ValueError(f"{path / 'depth.png'} is {counts.dtype}{list(counts.shape)}; save one channel of 16 bits")
+    label = read_png(path / "label.png") if (path / "label.png").exists() else None
+    if label is not None and label.ndim != 2:
+        raise ValueError(f"{path / 'label.png'} has {label.shape[2]} channels; save one channel of object ids")
+    for name, image in (("depth.png", counts), ("label.png", label)):
+        if image is not None and image.shape != (height, width):
+            raise ValueError(
+                f"{path / name} is {image.shape[1]}x{image.shape[0]} px but color.png is {width}x{height};"
+                f" align {name} to color.png"
+            )
+    depth = None if counts is None else (counts * np.float64(unit)).astype(np.float32)  # Frame turns 0 into NaN
+    try:
+        camera = Camera(width, height, meta["camera_matrix_px"], meta["distortion"], meta["distortion_model"])
+    except ValueError as error:
+        raise ValueError(f"{path / 'meta.json'}: {error}") from None
+    label = None if label is None else label.astype(np.int32)
+    return Frame(meta["stamp_ns"], meta["frame_id"], rgb, depth, label, camera, meta["T_world_camera"])
+
+
+def write_frame_folder(path: Path | str, frame: Frame) -> None:
+    """Write a frame as the folder that `read_frame_folder` reads, over an earlier one.
+
+    All comes back as it was, but depth only to within half a count of 0.1 mm (1 mm beyond 6.5 m). meta.json goes first
+    and comes last, so that a folder that was not finished is not read. Raises `ValueError` for ids that a label.png
+    cannot hold.
+    """
+    path = Path(path)
+    if frame.label is not None and not 0 <= frame.label.min() <= frame.label.max() <= 65535:
+        raise ValueError(f"object id {int(frame.label.max())} does not fit label.png; use 0 to 65535")
+    depth = unit = None
+    if frame.depth is not None:
+        metres = np.nan_to_num(frame.depth.astype(np.float64))
+        unit = DEPTH_UNIT_M if metres.max() <= 65535 * DEPTH_UNIT_M else 10 * DEPTH_UNIT_M
+        depth = np.minimum(np.rint(metres / unit), 65535).astype(np.uint16)
+    images = {
+        "color.png": frame.rgb[..., ::-1],
+        "depth.png": depth,
+        "label.png": None if frame.label is None else frame.label.astype(np.uint16),
+    }
+    meta = {
+        "camera_matrix_px": frame.camera.K.tolist(),
+        "distortion": frame.camera.distortion.tolist(),
+        "distortion_model": frame.camera.model,
+        "stamp_ns": int(frame.stamp_ns),
+        "frame_id": frame.frame_id,
+    }
+    if unit is not None:
+        meta["depth_unit_m"] = unit
+    if frame.T_world_camera is not None:
+        meta["T_world_camera"] = np.asarray(frame.T_world_camera, np.float64).tolist()
+    path.mkdir(parents=True, exist_ok=True)
+    for name in ("meta.json", *images):
+        (path / name).unlink(missing_ok=True)
+    for name, image in images.items():
+        if image is not None:
+            _replace(path / name, cv2.imencode(".png", image)[1].tobytes())
+    _replace(path / "meta.json", json.dumps(meta, indent=1).encode())
+
+
+def _replace(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_bytes(data)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def read_png(path: Path) -> Shaped[np.ndarray, "h w *c"]:
+    """The samples of a PNG, colours in OpenCV's order BGR(A). Raises where the file is absent, cut short or damaged."""
+    try:
+        data = path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        raise FileNotFoundError(f"{path} is missing; a frame folder holds color.png, depth.png and meta.json") from None
+    if not data.startswith(_PNG_MAGIC):
+        raise ValueError(f"{path} is not a PNG; save it again as PNG")
+    # OpenCV fills what is missing with zeros and only prints a warning, so the chunks are checked first.
+    at, kind = len(_PNG_MAGIC), b""
+    while kind != b"IEND":
+        size = int.from_bytes(data[at : at + 4], "big")
+        kind, end = data[at + 4 : at + 8], at + 12 + size
+        if end > len(data):
+            raise ValueError(f"{path} is cut short at byte {len(data)}; copy it again")
+        if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            raise ValueError(f"{path} is damaged near byte {at}; copy it again")
+        at = end
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise ValueError(f"{path} cannot be decoded; save it again as PNG")
+    return image
+
+
+def colour_to_rgb(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w 3"]:
+    """RGB from what OpenCV decodes: grey, BGR or BGRA."""
+    if image.ndim == 2 or image.shape[2] == 1:
+        return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)
+    return np.ascontiguousarray(image[:, :, 2::-1])
+
+
+def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
+    """meta.json, its keys checked, and what it may leave out filled in; depth_unit_m where there is `depth`."""
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise FileNotFoundError(f"{path} is missing; it gives camera_matrix_px and depth_unit_m") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not JSON ({error}); write it again") from None
+    for key in ("camera_matrix_px", "depth_unit_m"):
+        if not isinstance(meta, dict) or (key not in meta and (depth or key != "depth_unit_m")):
+            raise ValueError(f"{path} has no {key}; add it (3x3 in px, and metres per count of depth.png)")
+    unit = meta.get("depth_unit_m")
+    number = isinstance(unit, int | float) and not isinstance(unit, bool)
+    if "depth_unit_m" in meta and not (number and 0 < unit <= 1):
+        raise ValueError(f"{path}: depth_unit_m is {unit!r}; give metres per count, such as 0.001")
+    optional = {"distortion": [0.0] * 5, "distortion_model": "plumb_bob", "stamp_ns": 0, "frame_id": "camera"}
+    meta = {**optional, "T_world_camera": None, **meta}
+    for key, default in optional.items():
+        if isinstance(meta[key], bool) or not isinstance(meta[key], type(default)):
+            raise ValueError(f"{path}: {key} is {meta[key]!r}; give something like {default!r}, or leave it out")
+    meta["camera_matrix_px"] = _numbers(path, "camera_matrix_px", meta["camera_matrix_px"], (3, 3))
+    meta["distortion"] = _numbers(path, "distortion", meta["distortion"], (len(meta["distortion"]),))
+    if (T := meta["T_world_camera"]) is not None:
+        meta["T_world_camera"] = _numbers(path, "T_world_camera", T, (4, 4))
+        if not np.allclose(meta["T_world_camera"][3], [0, 0, 0, 1]):
+            raise ValueError(f"{path}: T_world_camera has last row {T[3]}; it must be 0 0 0 1 (is it transposed?)")
+        if not rigid(meta["T_world_camera"]):
+            raise ValueError(f"{path}: T_world_camera {T} is no rotation with a translation (m) beside it")
+    return meta
+
+
+def _numbers(path: Path, key: str, value: object, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"{path}: {key} {value!r} is not {' rows of '.join(map(str, shape))} finite numbers")
+    return array

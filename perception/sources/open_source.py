@@ -1,0 +1,57 @@
+"""The choice of a source by what names it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from calibration.camera import Camera
+from perception.sources.frame import Source, StillSource
+from perception.sources.frame_folder import read_frame_folder
+
+# The recording that ships with the project, read when no source is named.
+SHIPPED_LOG = Path(__file__).parent / "shipped.mcap"
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
+# What a source may be, for messages.
+SOURCES = (
+    "oak, oak:ID, webcam:N, a video file (.mp4, .avi, .mkv), a frame folder (color.png, depth.png, meta.json)"
+    " or a recording (.mcap, .bag, ROS 2 bag folder)"
+)
+
+
+def open_source(path: Path | str | None, camera: Camera | None = None) -> Source:
+    """The source that `path` names; None is the log shipped with the project.
+
+    `oak` or `oak:ID` is an OAK camera, `webcam:N` the camera /dev/videoN; else a video file (by its suffix), a frame
+    folder (it holds color.png) or a log. A file of such a name is given as ./oak. `camera` is the calibration for a
+    webcam or a video file, or in place of what an OAK camera, a log or a frame folder states; it must be of the size of
+    the images.
+
+    Raises `FileNotFoundError`, `OSError` or `ValueError` with one line that names file or device and the remedy.
+    """
+    kind, _, which = str(path).partition(":")
+    if kind == "oak":
+        from perception.sources.oak import open_oak  # here, because depthai takes a second to import
+
+        return open_oak(which, camera)
+    if kind == "webcam":
+        from perception.sources.webcam import Webcam  # here, because webcam.py makes Frames
+
+        return Webcam(which, camera)
+    path = SHIPPED_LOG if path is None else Path(path)
+    is_folder = (path / "color.png").exists() or (path / "meta.json").exists()
+    if not is_folder and not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; give {SOURCES}")
+    if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file():
+        from perception.sources.webcam import VideoFile
+
+        return VideoFile(path, camera)
+    if is_folder:
+        frame = read_frame_folder(path)
+        try:
+            return StillSource((frame if camera is None else replace(frame, camera=camera),))
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+    from perception.sources.recording import (
+        Log,  # here, because log.py makes Frames; and a folder needs no log libraries
+    )
+
+    return Log(path, camera=camera)

@@ -1,0 +1,89 @@
+"""Plain colour pictures for calibration: from a folder of images or any source. Their camera need not be known."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from perception.sources.frame import Frame, Source
+from perception.sources.frame_folder import colour_to_rgb, read_png
+from perception.sources.open_source import VIDEO_SUFFIXES, open_source
+from perception.sources.reader import Reader
+from perception.sources.recording import first_messages, open_log
+from perception.sources.ros_images import colour_topic, to_rgb
+
+_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A colour image, and what to call it in a message."""
+
+    name: str
+    rgb: UInt8[np.ndarray, "h w 3"]
+
+
+def pictures_of(frames: Iterable[Frame]) -> Iterator[Picture]:
+    """The pictures of frames, such as a live source gives."""
+    for number, frame in enumerate(frames):
+        yield Picture(f"frame {number}", frame.rgb)
+
+
+def open_pictures(source: Path | str) -> tuple[Iterator[Picture], int | None]:
+    """The pictures of `source` and their number; None for those of a stream.
+
+    `source` is a folder of images (in the order of their names), one image, a recording with a colour image (its
+    camera_info, depth and labels are not read), or else what `open_source` opens. A live source gives its newest
+    picture each time, until it ends. Raises FileNotFoundError, OSError or ValueError naming the source and the remedy.
+    """
+    path = Path(source)
+    if str(source).partition(":")[0] in ("oak", "webcam") or path.suffix in VIDEO_SUFFIXES or not path.exists():
+        opened = open_source(source)
+        return _newest(opened) if opened.live else pictures_of(opened), None
+    if path.is_dir():
+        files = sorted(p for p in path.iterdir() if p.suffix.lower() in _ENDINGS)
+        recording = (path / "metadata.yaml").exists() or any(p.suffix in (".mcap", ".db3") for p in path.iterdir())
+        if not files and not recording:
+            raise ValueError(f"{path} holds no image ({', '.join(_ENDINGS)}) and no recording; give a folder that does")
+    else:
+        files = [path] if path.suffix.lower() in _ENDINGS else []
+    if files:
+        return (Picture(file.name, _read_image(file)) for file in files), len(files)
+    return _logged(path), None
+
+
+def _newest(source: Source) -> Iterator[Picture]:
+    with Reader(source) as reader:
+        while (frame := reader.newest()) is not None:
+            yield Picture(f"frame {reader.counts().received - 1}", frame.rgb)
+
+
+def _logged(path: Path) -> Iterator[Picture]:
+    read, kinds, _ = open_log(path)
+    firsts = first_messages(read, {topic: kind for topic, kind in kinds.items() if kind in _IMAGES})
+    topic = colour_topic(path, {name: first.message for name, first in firsts.items()})
+    for number, received in enumerate(read({topic})):
+        try:
+            yield Picture(f"frame {number}", to_rgb(received.message))
+        except ValueError as error:
+            raise ValueError(f"{path}: frame {number} of {topic}: {error}") from None
+
+
+def _read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    if path.suffix.lower() == ".png":
+        image = read_png(path)
+    else:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+        decoded = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+        if decoded is None:
+            raise ValueError(f"{path} cannot be decoded; copy it again, or take it away")
+        image = decoded
+    if image.dtype == np.uint16:  # depth, or a camera's raw grey
+        image = (image >> 8).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise ValueError(f"{path} has {image.dtype} samples; save it with 8 bits a channel")
+    return colour_to_rgb(image)

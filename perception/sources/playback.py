@@ -1,0 +1,77 @@
+"""A recording played back: a part of it, at the pace at which it was made or as fast as it can be read."""
+
+import math
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from calibration.camera import Camera
+from perception.sources.frame import Frame, Source
+from perception.sources.open_source import SHIPPED_LOG, open_source
+from perception.sources.recording import Log
+
+
+class Playback:
+    """The frames of a log from `start_s` to `end_s` (None: its end), seconds after its first frame, as a Source.
+
+    With `pace` 1 frames come at the intervals of their stamps, with 2 twice as fast, with 0 as fast as they are read. A
+    frame that is asked for too late comes at once: whoever wants only the newest one must drop the others. Raises
+    ValueError for a range or a pace that is none, and in iteration, with the log's true range, where it has no frame.
+    """
+
+    def __init__(self, log: Log, pace: float = 1.0, start_s: float = 0.0, end_s: float | None = None) -> None:
+        self.log, self.pace = log, pace
+        self.start_s, self.end_s = start_s, math.inf if end_s is None else end_s
+        if not (math.isfinite(pace) and pace >= 0):
+            raise ValueError(f"{log.path}: pace {pace:g} is none; give 1 for the recording's own, or 0 for the fastest")
+        if not 0 <= self.start_s <= self.end_s:
+            until = "on" if end_s is None else f"to {end_s:g} s"
+            raise ValueError(f"{log.path}: from {start_s:g} s {until} is no range; give seconds after its first frame")
+
+        self._closed = threading.Event()
+
+    @property
+    def live(self) -> bool:
+        """At a pace, frames do not wait for who reads them."""
+        return self.pace > 0
+
+    def close(self) -> None:
+        """End the iteration under way."""
+        self._closed.set()
+
+    @property
+    def notes(self) -> list[str]:
+        """What was missing in the log."""
+        return self.log.notes
+
+    def __iter__(self) -> Iterator[Frame]:
+        begun: float | None = None
+        for frame in self.log.frames(self.start_s, self.end_s):
+            if begun is None:
+                begun, first_ns = time.monotonic(), frame.stamp_ns
+            if self.pace > 0:
+                due = begun + (frame.stamp_ns - first_ns) / 1e9 / self.pace
+                self._closed.wait(max(0.0, due - time.monotonic()))
+            if self._closed.is_set():
+                return
+            yield frame
+
+
+def open_playback(
+    path: Path | str | None,
+    pace: float = 0.0,
+    start_s: float = 0.0,
+    end_s: float | None = None,
+    camera: Camera | None = None,
+) -> Source:
+    """The source at `path`, with `camera` in place of its own (see `open_source`); a log as `Playback`.
+
+    Raises ValueError where a range is asked of a source that is no log, and whatever `open_source` raises.
+    """
+    source = open_source(path, camera)
+    if isinstance(source, Log):
+        return Playback(source, pace, start_s, end_s)
+    if start_s or end_s is not None:
+        raise ValueError(f"{path or SHIPPED_LOG} is no recording; leave --from and --to away")
+    return source

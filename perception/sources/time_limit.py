@@ -1,0 +1,40 @@
+"""A call that may hang, such as a device's, with a limit on its time."""
+
+import threading
+from collections.abc import Callable
+from queue import Empty, Queue
+
+from perception.sources.reader import Result
+
+
+def within(
+    limit_s: float, call: Callable[[], Result], complaint: str, late: Callable[[Result], object] | None = None
+) -> Result:
+    """What `call` returns or raises; `OSError` with the complaint if it takes longer, and then it is left behind.
+
+    What it returns after that goes to `late`, to be closed.
+    """
+    finished: Queue[Result | Exception] = Queue()
+    settled = threading.Lock()  # whoever takes it first: the waiting caller's patience, or the result
+
+    def work() -> None:
+        try:
+            result = call()
+        except Exception as error:  # raised again in the caller's thread
+            finished.put(error)
+            return
+        if settled.acquire(blocking=False):
+            finished.put(result)
+        elif late is not None:
+            late(result)
+
+    threading.Thread(target=work, name="farside device", daemon=True).start()
+    try:
+        result = finished.get(timeout=limit_s)
+    except Empty:
+        if settled.acquire(blocking=False):
+            raise OSError(complaint) from None
+        result = finished.get()  # it came at the last moment
+    if isinstance(result, Exception):
+        raise result
+    return result

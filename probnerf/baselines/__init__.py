@@ -1,1 +1,0 @@
-"""What the posterior is measured against."""

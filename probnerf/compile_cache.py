@@ -1,0 +1,215 @@
+"""Programs that outlive the process: `jax.jit` whose compiled code is read back without tracing anything.
+
+JAX's own cache of compiled code saves the compiler's time and not that of tracing and lowering, which here takes longer
+than to read it. So a program is found by what it is made from, without making it: the function and this package's
+source, its arguments' structure, shapes and static values, JAX's version and settings, and the processor. What that
+does not tell apart (a local function, or another package's) is left to `jax.jit`, and so is everything on other devices
+than CPUs, and where `FARSIDE_PROGRAMS` names no folder.
+"""
+
+import hashlib
+import inspect
+import os
+import pickle  # of files that this module wrote, beside machine code that it runs
+import platform
+import shutil
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import cache, update_wrapper
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import serialize_executable
+
+from probnerf.kernel import library
+from probnerf.kernel.build import LIBRARY
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+GENERATIONS = 3  # folders kept, of other versions and settings
+_LOCK = threading.RLock()
+_REHEARSING = ContextVar("rehearsing", default=False)
+
+
+@contextmanager
+def rehearsal() -> Iterator[None]:
+    """Within, programs that are kept are made ready for what they are given but not run: they hand back zeros."""
+    token = _REHEARSING.set(True)
+    try:
+        yield
+    finally:
+        _REHEARSING.reset(token)
+
+
+@cache
+def _folder() -> Path | None:
+    """Where programs are kept: in the folder that `FARSIDE_PROGRAMS` names. None, where it names none: nowhere."""
+    named = os.environ.get("FARSIDE_PROGRAMS")
+    if not named or jax.default_backend() != "cpu":
+        return None
+    own = Path(named) / f"programs-{_environment()}"
+    try:
+        own.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if own.stat().st_uid != os.getuid():  # what is read from it is run
+            return None
+        own.touch()
+        generations = sorted(own.parent.glob("programs-*"), key=lambda f: f.stat().st_mtime, reverse=True)
+    except OSError:  # as without: slower by some seconds
+        return None
+    for old in generations[GENERATIONS:]:
+        shutil.rmtree(old, ignore_errors=True)
+    return own
+
+
+class Program:
+    """A function as `jax.jit` compiles it, but for where its compiled code comes from."""
+
+    def __init__(
+        self, function: Callable[..., Any], static_argnames: tuple[str, ...] = (), rehearse: bool = True
+    ) -> None:
+        update_wrapper(self, function)
+        self._name = (function.__module__, function.__qualname__)
+        self.jitted = jax.jit(function, static_argnames=static_argnames)
+        self._static = static_argnames
+        self._rehearse = rehearse
+        self._signature = inspect.signature(function)
+        self._ready: dict[Any, Callable[..., Any]] = {}
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """As the function."""
+        if _folder() is None:
+            return self.jitted(*args, **kwargs)
+        given = self._signature.bind(*args, **kwargs).arguments
+        static = {name: given.pop(name) for name in self._static if name in given}
+        leaves, tree = jax.tree.flatten(given)
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            return self.jitted(*args, **kwargs)
+        key = (tree, tuple(map(_kind, leaves)), tuple(static.items()))
+        if key not in self._ready:
+            with _LOCK:
+                if key not in self._ready:
+                    self._ready[key] = self._found(given, static, key)
+        run = self._ready[key]
+        if self._rehearse and _REHEARSING.get() and isinstance(run, jax.stages.Compiled):
+            return jax.tree.map(lambda a: jax.device_put(np.zeros(a.shape, a.dtype), a.sharding), run.out_info)
+        return run(**given)
+
+    def _found(self, given: dict[str, Any], static: dict[str, Any], key: tuple) -> Callable[..., Any]:
+        """The program for these arguments: from its file, or compiled and kept there."""
+        said = " ".join((*self._name, str(key[0]), str(key[1]), _told(static)))
+        folder = _folder()
+        if " at 0x" in said or folder is None:  # an object whose name does not say what it is
+            return lambda **given: self.jitted(**given, **static)
+        path = folder / f"{self._name[1]}-{hashlib.sha256(said.encode()).hexdigest()[:32]}"
+        try:
+            return _read(path, given)
+        except Exception:  # not there, cut short, or of a library that reads it otherwise: made, and written over
+            pass
+        compiled = _compiled(self.jitted.lower(**given, **static))
+        _write(path, compiled)
+        return compiled
+
+
+def program(*static_argnames: str, rehearse: bool = True) -> Callable[[F], F]:
+    """Decorator: compiled once for each set of shapes and of static arguments, which have these names.
+
+    Without `rehearse` it is run in a rehearsal, too: what others are compiled for hangs on its values.
+    """
+
+    def decorate(function: F) -> F:
+        return cast(F, Program(function, static_argnames, rehearse))
+
+    return decorate
+
+
+def _compiled(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
+    """Compiled, and past JAX's own cache: what that hands back cannot be written once more."""
+    least = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", float("inf"))  # not written there,
+    try:
+        # and nothing read: an option at its default is part of the name under which JAX would look
+        return lowered.compile(compiler_options={"xla_embed_ir_in_executable": False})
+    finally:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
+
+
+def _write(path: Path, compiled: jax.stages.Compiled) -> None:
+    try:
+        code, _, out_tree = serialize_executable.serialize(compiled)
+    except (ValueError, NotImplementedError, jax.errors.JaxRuntimeError):
+        # it closes over arrays, or XLA does not write it a second time: compiled anew in each process
+        return
+    devices = {d.id for s in jax.tree.leaves(compiled.input_shardings) for d in s.device_set}
+    # the tree as an object: equinox's marks of absent fields do not survive in a pickled treedef
+    answer = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))
+    partial = path.with_suffix(f".{os.getpid()}")
+    try:
+        partial.write_bytes(pickle.dumps((code, sorted(devices), answer)))
+        partial.replace(path)
+    except OSError:  # a full disk costs the next start its time, and no answer
+        partial.unlink(missing_ok=True)
+
+
+def _read(path: Path, given: dict[str, Any]) -> Callable[..., Any]:
+    _with_lapack()
+    code, devices, answer = pickle.loads(path.read_bytes())
+    return serialize_executable.deserialize_and_load(
+        code,
+        jax.tree.structure(((), given)),
+        jax.tree.structure(answer),
+        execution_devices=[d for d in jax.devices() if d.id in devices],
+    )
+
+
+@cache
+def _with_lapack() -> None:
+    """Have JAX look up LAPACK's functions, as it does when it lowers the first call of one; without, code crashes."""
+    jnp.linalg.cholesky(jnp.ones((1, 1)))
+
+
+def _kind(leaf: Any) -> tuple:
+    """Shape and type of an argument, and where it lies unless on the first device."""
+    sharding = getattr(leaf, "sharding", None)
+    spread = sharding is not None and len(sharding.device_set) > 1
+    return (jax.api_util.shaped_abstractify(leaf), *((sharding,) if spread else ()))
+
+
+def _told(static: Mapping[str, Any]) -> str:
+    """Static arguments in words: functions of this package by name, as its source stands behind them."""
+    return repr({
+        name: f"{v.__module__}.{v.__qualname__}" if _is_plain(v) else v for name, v in sorted(static.items())
+    })  # fmt: skip
+
+
+def _is_plain(value: Any) -> bool:
+    ours = inspect.isfunction(value) and value.__module__.startswith("probnerf.")
+    return ours and "<" not in value.__qualname__ and value.__closure__ is None
+
+
+@cache
+def _environment() -> str:
+    """A digest of all that makes another program of the same function and arguments."""
+    package = Path(__file__).parent
+    source = hashlib.sha256()
+    for path in [*sorted(package.rglob("*.py")), LIBRARY]:
+        source.update(path.read_bytes() if path.is_file() else b"none")
+    settings = sorted((k, repr(v)) for k, v in jax.config.values.items() if "cache" not in k)
+    switches = sorted((k, v) for k, v in os.environ.items() if k.startswith(("XLA_", "FARSIDE_KERNEL")))
+    libraries = [version(name) for name in ("jax", "jaxlib", "equinox", "optax", "numpy")]
+    machine = [platform.machine(), _processor(), os.cpu_count(), str(jax.devices()), library.available()]
+    told = repr((source.hexdigest(), settings, switches, libraries, sys.version, machine))
+    return hashlib.sha256(told.encode()).hexdigest()[:16]
+
+
+def _processor() -> str:
+    """What instructions the processor knows, or its name."""
+    told = Path("/proc/cpuinfo")
+    lines = told.read_text().splitlines() if told.is_file() else []
+    return next((line for line in lines if line.startswith(("flags", "Features"))), platform.processor())

@@ -1,0 +1,236 @@
+"""Observation in, Posterior out: the model, the pixel likelihood and a sampler put together (unit cube only)."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Array
+
+from probnerf.compile_cache import program
+from probnerf.fields.base import Model
+from probnerf.kernel import library
+from probnerf.likelihood.dispatch import log_likelihood
+from probnerf.likelihood.pixel_terms import faces_of_view
+from probnerf.likelihood.settings import Likelihood
+from probnerf.prior.networks import ProbNeRF
+from probnerf.prior.posterior_network import Picture, encoder_positions, even_yaws, guesses
+from probnerf.rendering import foam
+from probnerf.sampling.annealed_hmc import AnnealedHMCConfig, annealed_hmc
+from probnerf.sampling.gaussian_mixture import GaussianMixture
+from probnerf.sampling.hmc import StageInfo
+from probnerf.sampling.modes import ModesConfig, mixture_of_modes
+from probnerf.sampling.populations import start_from
+from probnerf.sampling.tempered_smc import TemperedSMCConfig, tempered_smc
+from probnerf.types import Diagnostics, Observation, Posterior, on_device
+
+Method = Literal["tempered_smc", "annealed_hmc"]
+_log_likelihood = program()(log_likelihood)
+
+
+def quick_smc(populations: int, particles: int) -> TemperedSMCConfig:
+    """What two CPU cores move in seconds; `TemperedSMCConfig()` is the one that the laws are tested on.
+
+    Populations count alike: what decides between modes, a few nats, is less than the likelihood's own error and the
+    error of the evidence's estimates.
+    """
+    return TemperedSMCConfig(
+        populations=populations,
+        particles=particles,
+        start_particles=8 * particles,
+        moves=1,
+        leapfrog_steps=3,
+        ess_target=0.4,
+        target_acceptance=0.65,
+        final_stages=1,
+        keep=1,
+        evidence_power=0.0,
+        least_moved=1.0,
+    )
+
+
+@dataclass(frozen=True)
+class InferConfig:
+    """Which sampler, how much of it, and the pixel likelihood's numbers."""
+
+    method: Method = "tempered_smc"
+    modes: ModesConfig = field(default_factory=ModesConfig)  # where tempered_smc begins
+    # From modes each of many small populations follows one or two to the end. From the prior few particles all descend
+    # from one or two starts, and lose the other modes.
+    smc: TemperedSMCConfig = field(default_factory=lambda: quick_smc(8, 8))
+    smc_from_prior: TemperedSMCConfig = field(default_factory=lambda: quick_smc(4, 48))
+    hmc: AnnealedHMCConfig = field(default_factory=AnnealedHMCConfig)
+    lattice: int = 32  # G: cubes per 2 units
+    extent: float = 1.1  # the lattice covers [-extent, extent]^3: an object may be larger than its guessed cube
+    below: float = 0.15  # and so much under the plane, for its height is uncertain
+    colour_sigma: float = 0.3  # s: what the prior cannot draw of a print or a band, too
+    wall_sigma: float = 0.05  # cube units: the model's own error in a wall's place; wide, for small misfits are shared
+    outlier: float = 0.01  # share of ranges from nowhere; small, for a lid over a visible cavity is no outlier
+    reach: float = 0.3  # cube units behind a measured range beyond which nothing is asked
+    # kappa: what one ray counts for, which stands for many pixels; with 1 validation objects' answers were too cautious
+    power: float = 2.0
+    encoder_starts: bool = True  # begin at the modes that the encoder's guesses climb to; otherwise at the prior
+    sample_delta: bool = False  # also infer the weights' perturbation delta
+
+    def __post_init__(self) -> None:
+        if self.lattice < 1 or not min(self.extent, self.colour_sigma, self.wall_sigma, self.power) > 0:
+            raise ValueError(
+                f"lattice {self.lattice} must be 1 or more, and extent {self.extent:g}, colour_sigma"
+                f" {self.colour_sigma:g}, wall_sigma {self.wall_sigma:g} and power {self.power:g} more than 0"
+            )
+
+
+def likelihood_settings(config: InferConfig, sample_pose: bool = True) -> Likelihood:
+    """The likelihood's settings, for any view."""
+    return Likelihood(
+        lattice=foam.Lattice(config.lattice, config.extent, below=config.below),
+        colour_sigma=config.colour_sigma,
+        wall_sigma=config.wall_sigma,
+        outlier=config.outlier,
+        reach=config.reach,
+        power=config.power,
+        sample_pose=sample_pose,
+        sample_delta=config.sample_delta,
+    )
+
+
+def likelihood_of(config: InferConfig, observation: Observation, sample_pose: bool = True) -> Likelihood:
+    """The likelihood's settings for one view, with its sizes where there is no kernel (`with_sizes`)."""
+    likelihood = likelihood_settings(config, sample_pose)
+    return likelihood if library.available() else with_sizes(likelihood, observation)
+
+
+def with_sizes(likelihood: Likelihood, observation: Observation) -> Likelihood:
+    """The settings with one view's number of crossings, which plain JAX packs: padded, so that most views share one
+    compiled program.
+    """
+    lattice = likelihood.lattice
+    each = np.sum(np.asarray(faces_of_view(observation, likelihood)) < foam.FAR, axis=1)
+
+    def padded(count: int, step: int) -> int:
+        return step * max(1, math.ceil(count / step))
+
+    most = min(padded(each.max(), 64), 3 * lattice.planes)
+    packed = (padded(each[: observation.colour_count].sum(), 512), padded(each.sum(), 1024))
+    return replace(likelihood, lattice=replace(lattice, max_crossings=most), packed=packed)
+
+
+def crossings_of(likelihood: Likelihood, observation: Observation) -> int:
+    """Crossings of a view at which the field is evaluated for each particle."""
+    return int(np.sum(np.asarray(faces_of_view(observation, likelihood)) < foam.FAR))
+
+
+def without_sizes(likelihood: Likelihood) -> Likelihood:
+    """The settings less the padded sizes of one view, so that what is asked of shapes compiles once for all views."""
+    lattice = likelihood.lattice
+    return replace(likelihood, lattice=replace(lattice, max_crossings=3 * lattice.planes), packed=(0, 0))
+
+
+def asks_encoder(config: InferConfig, model: Model, picture: Picture | None) -> bool:
+    """Whether there is an encoder to ask, enough for it to see, and use for what it says."""
+    # delta has too many dimensions for second derivatives
+    if picture is None or not config.encoder_starts or config.sample_delta or not isinstance(model, ProbNeRF):
+        return False
+    return float(np.mean(np.asarray(picture.unknown))) <= config.modes.unknown
+
+
+def modes_of(
+    key: Array, model: Model, observation: Observation, config: InferConfig, picture: Picture | None
+) -> GaussianMixture | None:
+    """Where tempering begins: the modes that the encoder's guesses climb to (`sampling.modes`), the pose unknown.
+
+    None, the prior, where there is no encoder to ask or too little for it to see. Behind something that hides half of
+    the object its guesses are poor, and modes about them miss what populations from the prior find.
+    """
+    if not asks_encoder(config, model, picture):
+        return None
+    assert isinstance(model, ProbNeRF) and picture is not None
+    likelihood = likelihood_of(config, observation)
+    starts = guesses(key, model, picture, config.modes.starts)
+    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
+    return mixture_of_modes(args, starts, config.modes)
+
+
+def sampler_of(
+    config: InferConfig, reference: GaussianMixture | None, before: Posterior | None = None
+) -> TemperedSMCConfig:
+    """The populations for where tempering begins; what goes on from `before` keeps to those that made it."""
+    if before is None:
+        return config.smc_from_prior if reference is None else config.smc
+    made = len(before.diagnostics.beta)
+    both = [smc for smc in (config.smc, config.smc_from_prior) if made % smc.populations == 0]
+    each = len(before.positions) / made  # several runs of the one may be as many populations as one of the other
+    return min(both, key=lambda smc: abs(each - smc.moves * smc.particles), default=config.smc_from_prior)
+
+
+def infer(
+    key: Array,
+    model: Model,
+    observation: Observation,
+    config: InferConfig | None = None,
+    *,
+    reference: GaussianMixture | None = None,
+    before: Posterior | None = None,
+    sample_pose: bool = True,
+    on_stage: Callable[[StageInfo], bool | None] | None = None,
+    deadline: float | None = None,
+    stages: int | None = None,
+) -> tuple[Posterior, Likelihood]:
+    """Sample p(z~, pose, delta | observation).
+
+    `reference` is where tempering begins (`modes_of`; None: the prior); `before`, instead, a posterior of the same
+    latents that was cut short, to go on from. `deadline` is on time.monotonic()'s clock; `stages` caps the sampler's
+    stages (iterations of annealed HMC, whose schedule is shortened to fit). The start is always made.
+    """
+    config = config or InferConfig()
+    likelihood = likelihood_of(config, observation, sample_pose)
+    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
+    dim = likelihood.dim(model)
+    if config.method == "annealed_hmc":
+        hmc = (
+            config.hmc if stages is None else replace(config.hmc, iterations=stages, keep=min(config.hmc.keep, stages))
+        )
+        return annealed_hmc(key, log_likelihood, args, dim, hmc, on_stage=on_stage, deadline=deadline), likelihood
+    smc = sampler_of(config, reference, before)
+    initial = None if before is None else start_from(before, smc.populations)
+    posterior = tempered_smc(
+        key, log_likelihood, args, dim, smc, initial=initial, reference=reference if before is None else None,
+        on_stage=on_stage, deadline=deadline, stages=stages,
+    )  # fmt: skip
+    return posterior, likelihood
+
+
+def encoder_guess(
+    key: Array,
+    model: ProbNeRF,
+    likelihood: Likelihood,
+    observation: Observation,
+    picture: Picture,
+    yaws: int = 24,
+    draws: int = 4,
+) -> Posterior:
+    """What the encoder alone takes the object for, in a twentieth of a second: z_kj ~ q(z | picture, yaw_k) on a grid.
+
+    The weight of yaw k is its mean likelihood, W_k = sum_j p(observation | z_kj, yaw_k) / J, shared evenly by its J
+    draws: within a yaw the encoder is taken at its word. x, y and scale are perception's guess. Where the pose is
+    known there is one yaw, of which all are drawn.
+    """
+    if likelihood.sample_pose:
+        positions = encoder_positions(key, model, picture, even_yaws(yaws), draws, 1.0)
+    else:
+        yaws, draws = 1, yaws * draws
+        positions = guesses(key, model, picture, draws, sample_pose=False)
+    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
+    values = np.asarray(_log_likelihood(args, positions), np.float64)
+    values = np.where(np.isfinite(values), values, -np.inf)
+    top = values.max()
+    each = np.exp(values - top).reshape(yaws, draws).mean(axis=1) if np.isfinite(top) else np.ones(yaws)
+    with np.errstate(divide="ignore"):
+        log_weights = np.log(np.repeat(each / each.sum() / draws, draws))
+    nan, zero, none = on_device(np.nan), on_device(0, np.int32), on_device(0.0)
+    nans, ess = on_device(np.full(len(values), np.nan)), on_device(1.0 / np.sum(np.exp(2.0 * log_weights)))
+    diagnostics = Diagnostics(nan, zero, nan, ess, zero, zero, none, on_device(np.zeros(1)), on_device([np.nan]))
+    likelihoods, population = on_device(values), on_device(np.zeros(len(values)), np.int32)
+    weights = on_device(log_weights)
+    return Posterior(positions, weights, likelihoods, nans, population, nan, nan, diagnostics, "underway")

@@ -1,0 +1,33 @@
+"""The pixel likelihood's settings."""
+
+import math
+
+import equinox as eqx
+
+from probnerf.fields.base import Model
+from probnerf.rendering import foam
+from probnerf.types import POSE_SIZE
+
+
+class Likelihood(eqx.Module):
+    """The pixel model's settings; they travel with every posterior."""
+
+    lattice: foam.Lattice
+    colour_sigma: float = eqx.field(static=True, default=0.1)  # s
+    mask_error: float = eqx.field(static=True, default=0.01)  # epsilon, each way
+    outlier: float = eqx.field(static=True, default=0.05)  # pi: depth from nowhere, uniform over `outlier_span`
+    outlier_span: float = eqx.field(static=True, default=2.5)  # cube units
+    wall_sigma: float = eqx.field(static=True, default=0.02)  # floor of the model's own wall error, cube units
+    reach: float = eqx.field(
+        static=True, default=math.inf
+    )  # OBJECT: a surface so far behind the range is as good as none
+    packed: tuple[int, int] = eqx.field(static=True, default=(0, 0))  # most crossings: colour rays', all; 0: no packing
+    power: float = eqx.field(static=True, default=1.0)  # kappa; other than 1 is a stated power likelihood
+    sample_pose: bool = eqx.field(static=True, default=True)
+    sample_delta: bool = eqx.field(static=True, default=False)
+    delta_scale: float = eqx.field(static=True, default=0.025)  # sqrt(alpha)
+
+    def dim(self, model: Model) -> int:
+        """Length of a position vector."""
+        weights = model.field.size if self.sample_delta else 0  # type: ignore[attr-defined]
+        return model.latent + POSE_SIZE * self.sample_pose + weights

@@ -1,0 +1,140 @@
+"""The paper's sampler: independent Hamiltonian chains that are cooled as they go."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from probnerf.sampling.hmc import HMCState, LogLikelihood, StageInfo, Target, hmc_step, split_r_hat
+from probnerf.types import Diagnostics, Posterior
+
+
+@dataclass(frozen=True)
+class AnnealedHMCConfig:
+    """The paper's schedule. It names neither start nor base step: chains start at the prior, the step is tuned."""
+
+    chains: int = 8
+    iterations: int = 100
+    leapfrog_steps: int = 100
+    s_start: float = 5.0  # observation noise scale at the first iteration ...
+    s_end: float = 0.1  # ... and at the last: the scale that the log-likelihood was written for
+    keep: int = 16  # last states of each chain that become samples
+    step_per_scale: float = 0.05  # step size divided by s_t
+    tune_iterations: int = 20  # over these, step_per_scale follows the acceptance; then it is fixed (0: never tuned)
+    target_acceptance: float = 0.8
+
+    def __post_init__(self) -> None:
+        if not (self.chains >= 1 and self.leapfrog_steps >= 1 and self.step_per_scale > 0):
+            raise ValueError("AnnealedHMCConfig: chains, leapfrog_steps and step_per_scale must be positive")
+        if not 1 <= self.keep <= self.iterations:
+            raise ValueError(f"AnnealedHMCConfig: keep {self.keep} must lie between 1 and iterations {self.iterations}")
+        if not 0 < self.s_end <= self.s_start:
+            raise ValueError(f"AnnealedHMCConfig: need 0 < s_end <= s_start, got {self.s_end} and {self.s_start}")
+
+
+MAX_ANNEALED_STEP = 1.0  # radians: a turn of the prior beyond it is never useful
+
+
+@partial(jax.jit, static_argnames=("log_likelihood", "chains", "dim"))
+def _annealed_start(key, args, *, log_likelihood: LogLikelihood, chains: int, dim: int) -> HMCState:
+    return Target(log_likelihood, args, jnp.zeros(())).evaluate(jax.random.normal(key, (chains, dim)))
+
+
+@partial(jax.jit, static_argnames=("log_likelihood", "steps"))
+def _annealed_step(key, state, args, beta, step_size, *, log_likelihood: LogLikelihood, steps: int):
+    return hmc_step(key, state, Target(log_likelihood, args, beta), step_size, steps)
+
+
+def annealed_hmc(
+    key: PRNGKeyArray,
+    log_likelihood: LogLikelihood,
+    args: Any,
+    dim: int,
+    config: AnnealedHMCConfig | None = None,
+    *,
+    on_stage: Callable[[StageInfo], bool | None] | None = None,
+    deadline: float | None = None,
+) -> Posterior:
+    """The paper's sampler (section 3.3): independent chains cooled from s_start to s_end, s_t = s_0^(1-t/T) s_T^(t/T).
+
+    Every likelihood term is multiplied by (s_end / s_t)^2 and the step size is proportional to s_t. Kept are the last
+    `keep` states of each chain, equally weighted; all but the very last are drawn at s_t > s_end, so this is no sample
+    of the posterior, and there is no evidence (NaN). The integrator is the split one with identity mass. `deadline` is
+    on time.monotonic()'s clock. result is "stages" when the schedule was completed, else "budget", "stopped" (by
+    `on_stage`) or "interrupted", with the states at hand. `point_gradients` counts gradients of whole positions.
+    """
+    config = config or AnnealedHMCConfig()
+    begun = time.monotonic()
+    start_key, key = jax.random.split(key)
+    state = _annealed_start(start_key, args, log_likelihood=log_likelihood, chains=config.chains, dim=dim)
+    kept = [(np.asarray(state.position), np.asarray(state.log_likelihood))]
+    acceptances: list[float] = []
+    divergences, base, beta, result = 0, config.step_per_scale, 0.0, "stages"
+    base = min(base, MAX_ANNEALED_STEP / config.s_start)
+
+    def samples(result: str = "underway") -> Posterior:
+        return _annealed_posterior(config, kept, acceptances, divergences, beta, result)
+
+    try:
+        for t in range(1, config.iterations + 1):
+            # An iteration costs about the mean of those before: none is begun that would overrun the deadline.
+            now = time.monotonic()
+            if deadline is not None and now + (now - begun) / t > deadline:
+                result = "budget"
+                break
+            scale = config.s_start * (config.s_end / config.s_start) ** (t / config.iterations)
+            beta, step = (config.s_end / scale) ** 2, base * scale
+            state, info = _annealed_step(
+                jax.random.fold_in(key, t), state, args, np.float32(beta), np.float32(step),
+                log_likelihood=log_likelihood, steps=config.leapfrog_steps,
+            )  # fmt: skip
+            acceptances.append(float(np.mean(np.asarray(info.acceptance))))
+            divergences += int(np.sum(np.asarray(info.divergent)))
+            kept = [*kept, (np.asarray(state.position), np.asarray(state.log_likelihood))][-config.keep :]
+            if t <= config.tune_iterations:
+                base *= float(np.exp(acceptances[-1] - config.target_acceptance))
+                base = min(base, MAX_ANNEALED_STEP / config.s_start)
+            if on_stage is not None:
+                none, seconds = (float("nan"),), time.monotonic() - begun
+                told = StageInfo(t, (beta,), none, (acceptances[-1],), (step,), none, divergences, seconds, samples)
+                if on_stage(told):
+                    result = "stopped"
+                    break
+    except KeyboardInterrupt:
+        result = "interrupted"
+    return samples(result)
+
+
+def _annealed_posterior(config, kept, acceptances, divergences, beta, result) -> Posterior:
+    positions = np.stack([q for q, _ in kept])  # [kept, chains, dim]
+    values = np.stack([value for _, value in kept])
+    count, dim = values.size, positions.shape[-1]
+    done = len(acceptances)
+    nan = jnp.asarray(np.float32("nan"))
+    return Posterior(
+        positions=jnp.asarray(positions.reshape(count, dim)),
+        log_weights=jnp.asarray(np.full(count, -np.log(count), np.float32)),
+        log_likelihoods=jnp.asarray(values.reshape(count)),
+        log_density=jnp.asarray(np.full(count, np.nan, np.float32)),
+        population=jnp.asarray(np.tile(np.arange(config.chains, dtype=np.int32), len(kept))),
+        log_evidence=nan,
+        log_evidence_se=nan,
+        diagnostics=Diagnostics(
+            acceptance=jnp.asarray(np.float32(np.mean(acceptances[-config.keep :]) if done else "nan")),
+            divergences=jnp.asarray(np.int32(divergences)),
+            r_hat=jnp.asarray(np.float32(split_r_hat(values.T))),
+            ess=jnp.asarray(np.float32(count)),
+            ancestors=jnp.asarray(np.int32(config.chains)),
+            stages=jnp.asarray(np.int32(done)),
+            point_gradients=jnp.asarray(np.float32(config.chains * (1 + done * config.leapfrog_steps))),
+            beta=jnp.asarray(np.full(config.chains, beta, np.float32)),
+            log_evidences=jnp.asarray(np.full(config.chains, np.nan, np.float32)),
+        ),
+        result=result,
+    )

@@ -1,0 +1,117 @@
+"""What is asked of sampled positions: their shapes as voxels, their poses, and how many pixels they explain."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, UInt8
+
+from probnerf.compile_cache import program
+from probnerf.fields.base import Model
+from probnerf.likelihood.dispatch import density_at
+from probnerf.likelihood.pixel_terms import faces_of_view
+from probnerf.likelihood.position import pose_of, range_offset_of, split_position
+from probnerf.likelihood.settings import Likelihood
+from probnerf.rendering import foam
+from probnerf.types import BASE_Z, OBJECT, POSE_SIZE, UNKNOWN, Observation, Pose
+
+_NOWHERE = 50.0  # cube units, outside every window: the kernel passes such points over
+WALL_ERROR = 0.02  # cube units; how well the prior's shapes place a wall
+
+
+@program()
+def opacity_grids(
+    model: Model,
+    likelihood: Likelihood,
+    positions: Float[Array, "s d"],
+    pose_sigma: Float[Array, "5"],
+    asked: Bool[Array, "g g g"],
+) -> UInt8[Array, "s g g g"]:
+    """round(255 x opacity across a voxel) of each position's shape on [-1, 1]^3 of the view frame, 0 if not `asked`.
+
+    A voxel's opacity is the largest at its eight corners: like the truth's, it is a wall where it meets the solid.
+    """
+    grid = asked.shape[0]
+    axis = jnp.linspace(-1.0, 1.0, grid + 1)
+    points = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    corners = jax.lax.reduce_window(jnp.pad(asked, 1), False, jnp.logical_or, (2, 2, 2), (1, 1, 1), "valid")
+    points = jnp.where(corners[..., None], points, _NOWHERE).reshape(-1, 3)
+    decoded = jax.vmap(model.decode)(positions[:, : model.latent])  # together, as in `plain_log_likelihood`
+
+    def one(item: tuple[Float[Array, "d"], Float[Array, "w"]]) -> UInt8[Array, "g g g"]:
+        position, decoded = item
+        weights, pose = split_position(model, likelihood, position, pose_sigma, decoded)
+        sigma = density_at(model.field, weights, pose, points)
+        scale = jnp.ones(()) if pose is None else jnp.exp(pose.log_scale)
+        corner = jnp.round(-255.0 * jnp.expm1(-sigma * scale / grid)).astype(jnp.uint8)
+        corner = corner.reshape(grid + 1, grid + 1, grid + 1)
+        largest = jax.lax.reduce_window(corner, jnp.uint8(0), jax.lax.max, (2, 2, 2), (1, 1, 1), "valid")
+        return jnp.where(asked, largest, 0)
+
+    return jax.lax.map(one, (positions, decoded))
+
+
+@program()
+def poses(model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "5"]) -> Pose:
+    """Pose of each position (identity where the pose was known)."""
+    if not likelihood.sample_pose:
+        zeros = jnp.zeros(positions.shape[0])
+        return Pose(*[zeros] * 5)
+    k = model.latent
+    return pose_of(positions[:, k : k + POSE_SIZE], pose_sigma)
+
+
+def scaled_about(
+    model: Model,
+    positions: Float[Array, "s d"],
+    pose_sigma: Float[Array, "5"],
+    origin: Float[Array, "3"],
+    log_factor: Float[Array, "s"],
+) -> Float[Array, "s d"]:
+    """Positions whose shapes are scaled about a point: p -> origin + exp(log_factor) (p - origin), view frame.
+
+    Scaled about the camera a shape keeps its picture: what ray it is met on, in which order. Only ranges tell. The
+    positions' poses must be sampled.
+    """
+    at = model.latent + 2  # of x, y, log-scale, range offset, z
+    pose = pose_of(positions[:, model.latent : model.latent + POSE_SIZE], pose_sigma)
+    foot = jnp.stack([pose.x, pose.y, BASE_Z + pose.z], axis=-1)
+    shift = jnp.expm1(log_factor)[:, None] * (foot - origin)
+    moved = jnp.stack([shift[:, 0], shift[:, 1], log_factor, jnp.zeros_like(log_factor), shift[:, 2]], axis=-1)
+    return positions.at[:, at : at + 5].add(moved / jnp.maximum(pose_sigma, 1e-9))
+
+
+@program()
+def explained(
+    model: Model, likelihood: Likelihood, observation: Observation, positions: Float[Array, "s d"]
+) -> Float[Array, "s"]:
+    """Share of telling pixels that each position explains: object pixels hit at the measured range, free ones missed.
+
+    A range is explained within 3 standard deviations of the sensor's error and of a well-placed wall's (`WALL_ERROR`):
+    what the likelihood forgives (`wall_sigma`) is more than what a shape of the prior needs.
+    """
+    t = faces_of_view(observation, likelihood)
+    status = observation.status
+    tells = (status != UNKNOWN) | (observation.limit > 0)
+    # padding is put where the window is 0, which costs nothing
+    points = jnp.where((t < foam.FAR)[..., None], foam.points_on_rays(observation.rays, t), foam.FAR)
+    decoded = jax.vmap(model.decode)(positions[:, : model.latent])
+
+    def one(item: tuple[Float[Array, "d"], Float[Array, "w"]]) -> Float[Array, ""]:
+        """One position's share, given its decoded weights."""
+        position, decoded = item
+        weights, pose = split_position(model, likelihood, position, observation.pose_sigma, decoded)
+        sigma = density_at(model.field, weights, pose, points)
+        scale = jnp.ones(()) if pose is None else jnp.exp(pose.log_scale)
+        faces = foam.composite(sigma, t, scale / likelihood.lattice.cubes)
+        w = jnp.exp(faces.log_weight)
+        hit = -jnp.expm1(faces.log_transmittance[:, -1])
+        tolerance = 3.0 * jnp.sqrt(observation.range_sigma**2 + WALL_ERROR**2)
+        offset = range_offset_of(model, likelihood, position, observation.pose_sigma)
+        close = jnp.abs(t - (observation.range - offset)[:, None]) <= tolerance[:, None]
+        at_range = jnp.sum(jnp.where(close, w, 0.0), axis=-1)
+        before = jnp.sum(jnp.where(t <= observation.limit[:, None], w, 0.0), axis=-1)
+        good = jnp.where(
+            status == OBJECT, jnp.where(observation.range_valid, at_range, hit), 1.0 - jnp.where(tells, before, 0.0)
+        )
+        return jnp.sum(jnp.where(tells, good > 0.5, False)) / jnp.maximum(jnp.sum(tells), 1)
+
+    return jax.lax.map(one, (positions, decoded))

@@ -1,0 +1,340 @@
+"""ELBO training of a prior (paper §2.2): procedural objects in, ProbNeRF weights out. Two phases.
+
+Solid phase: what is solid and what colour surfaces have (`solids`), observed at points. It needs no picture and costs
+a tenth of rays; it makes the decoder. Ray phase: pixels of views as well, through the same joint pixel likelihood that
+inference uses, on a lattice that is turned, shifted and scaled at random; and the picture encoder. All are
+observations, the objective is an ELBO throughout: N_points E[log p] + N_colours E[log p] + N_rays E[log p] - weight KL.
+Pixels are drawn by strata (object, near it, elsewhere) and weighted by each stratum's size, so that the pixel term is
+an unbiased estimate of its mean over all pixels.
+
+Unlike the paper's, q(z) is not read off pictures: `Recognition` is told the object's exact description, and the decoder
+learns several times faster. The picture encoder learns to cover the recognised z (forward KL), so that what a view
+leaves open stays open in its answer. With pictures alone (`solids` is None) it is the paper's way: every step is one of
+rays, with q(z) from the picture encoder.
+"""
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+
+from probnerf.likelihood.dispatch import map_with_gradient, weighted_terms
+from probnerf.likelihood.settings import Likelihood
+from probnerf.objects.tabletop import description, sample_object
+from probnerf.prior.encoder_input import camera_features, encoder_image
+from probnerf.prior.networks import ProbNeRF, Recognition
+from probnerf.rendering import foam
+from probnerf.training.batches import Batch, draw_batch, strata_of
+from probnerf.training.pictures import ViewSet
+from probnerf.training.surface_samples import Solids, colour_samples, shape_samples
+from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """The recipe. Steps count optimiser updates; every number travels with the weights."""
+
+    steps: int = 48_500
+    solid_steps: int = 44_000  # of these, the first so many are the solid phase
+    batch: int = 64  # objects per step in the solid phase
+    ray_batch: int = 16  # objects per step afterwards
+    views: int = 3  # encoder views per object; a random number of them is used
+    object_rays: int = 48
+    near_rays: int = 24  # free pixels within 2 pixels of the object
+    far_rays: int = 8
+    points: int = 512  # solid samples per object
+    colours: int = 192  # surface colours per object
+    finer: float = 2.0  # solid samples are opaque on a lattice finer by this
+    grazing: float = 1.0  # empty ones are transparent to a ray that meets so many faces there
+    effective_rays: float = 1500.0  # N_rays: independent residuals per object
+    effective_points: float = 10_000.0  # N_points
+    effective_colours: float = 800.0  # N_colours
+    learning_rate: float = 2e-3
+    ray_learning_rate: float = 3e-4  # of all but the encoder, in the ray phase
+    final_learning_rate: float = 2e-5
+    warmup: int = 500
+    frozen_steps: int = 0  # the decoder stands still so long: where it is trained already, recognition comes to it
+    kl_warmup: int = 2_000
+    seed: int = 0
+    checkpoint_every: int = 500
+    log_every: int = 50
+    map_batch: int | None = None  # objects per vectorised chunk of the field (None: one by one, best on a CPU)
+
+
+def encode(model: ProbNeRF, batch: Batch) -> tuple[Float[Array, "b k"], Float[Array, "b k"]]:
+    """Mean and precision of q(z | views) per object."""
+
+    def one(rgb, distance, unknown, used, T, tangent):
+        images = jax.vmap(encoder_image)(rgb / 255.0, distance, unknown.astype(jnp.float32), T, tangent)
+        return model.encoder(images, jax.vmap(camera_features)(T, tangent), used)
+
+    return jax.vmap(one)(
+        batch.rgb, batch.distance, batch.unknown, batch.used, batch.T_object_camera, batch.tan_half_fov
+    )
+
+
+def kl_estimate(model: ProbNeRF, z: Array, mean: Array, precision: Array) -> Float[Array, ""]:
+    """log q(z | views) - log N(m^-1(z); 0, I) |dm^-1/dz| at one draw z (paper, eq. of the ELBO)."""
+    z_tilde, log_det = model.flow.inverse(z)
+    log_q = 0.5 * jnp.sum(jnp.log(precision) - precision * (z - mean) ** 2)
+    return log_q - (log_det - 0.5 * jnp.sum(z_tilde**2))
+
+
+def encoder_loss(model: ProbNeRF, batch: Batch, z: Float[Array, "b k"]) -> Float[Array, ""]:
+    """-log q(z | views) of the recognised z: the encoder learns to cover what views leave open, not to pick a mode."""
+    mean, precision = encode(model, batch)
+    z = jax.lax.stop_gradient(z)
+    return -0.5 * jnp.mean(jnp.sum(jnp.log(precision) - precision * (z - mean) ** 2, axis=-1))
+
+
+def _solid_terms(shared: tuple, item: tuple, weights: Array) -> Float[Array, ""]:
+    """Mean log-likelihood of solid samples and of surface colours, each times its count."""
+    field, likelihood, config = shared
+    points, inside, place, view, rgb, valid = item
+    tau = field.density(weights, points) * foam.window(points) / likelihood.lattice.cubes
+    # a grazing ray meets several faces outside, a finer lattice has thinner ones inside: both sharpen the wall
+    probability = jnp.where(inside, -jnp.expm1(-tau / config.finer), jnp.exp(-config.grazing * tau))
+    eps = likelihood.mask_error
+    solid = jnp.mean(jnp.log(eps + (1.0 - 2.0 * eps) * probability))
+    sigma = jax.lax.stop_gradient(field.density(weights, place))
+    squared = jnp.sum((field.colour(weights, place, view, sigma) - rgb) ** 2, axis=-1)
+    counted = jnp.sum(jnp.where(valid, squared, 0.0)) / jnp.maximum(jnp.sum(valid), 1)
+    colour = -0.5 * counted / likelihood.colour_sigma**2
+    return config.effective_points * solid + config.effective_colours * colour
+
+
+class _ObjectRays(eqx.Module):
+    """One object's rays."""
+
+    origin: Array
+    direction: Array
+    rgb: Array
+    range: Array
+    weight: Array
+    turn: Array
+
+
+def _ray_terms(shared: tuple, item: tuple[_ObjectRays, tuple | None], weights: Array) -> Float[Array, ""]:
+    """Weighted mean of the joint pixel log-likelihood over a lattice that is turned, shifted and scaled; and solids.
+
+    The first rays are the object's; one whose range is negative has none, and says only that it hits, and its colour.
+    """
+    field, likelihood, config = shared
+    seen, solids = item
+    pose = Pose(yaw=seen.turn[0], x=seen.turn[1], y=seen.turn[2], log_scale=seen.turn[3], z=jnp.zeros(()))
+    scale = jnp.exp(pose.log_scale)
+    rays = Rays(origin=_to_view(pose, seen.origin), direction=_turn(pose, seen.direction))
+    n = config.object_rays
+    count = seen.range.shape[0]
+    observation = Observation(
+        rays=rays,
+        status=jnp.where(jnp.arange(count) < n, OBJECT, FREE),
+        rgb=seen.rgb,
+        rgb_valid=jnp.ones(count, bool),
+        range=seen.range * scale,
+        range_sigma=jnp.full((count,), 0.01),
+        range_valid=seen.range > 0,
+        limit=jnp.full((count,), 0.5 * foam.FAR),
+        pose_sigma=jnp.zeros(5),
+        colour_count=n,
+    )
+    t = foam.crossings(rays, likelihood.lattice)
+    fit = config.effective_rays * weighted_terms(field, weights, pose, likelihood, observation, t, seen.weight)
+    return fit if solids is None else fit + _solid_terms(shared, solids, weights)
+
+
+def _turn(pose: Pose, d: Array) -> Array:
+    c, s = jnp.cos(pose.yaw), jnp.sin(pose.yaw)
+    return jnp.stack([c * d[:, 0] - s * d[:, 1], s * d[:, 0] + c * d[:, 1], d[:, 2]], axis=-1)
+
+
+def _to_view(pose: Pose, p: Array) -> Array:
+    """Canonical points in the view frame: the inverse of Pose.to_object."""
+    base = jnp.array([0.0, 0.0, foam.BASE_Z])
+    return jnp.exp(pose.log_scale) * _turn(pose, p - base) + base + jnp.stack([pose.x, pose.y, pose.z])
+
+
+def loss(
+    networks: tuple[ProbNeRF, Recognition],
+    solids: Solids | None,
+    batch: Batch | None,
+    key: Array,
+    kl_weight: Array,
+    likelihood: Likelihood,
+    config: TrainConfig,
+) -> tuple[Array, dict[str, Array]]:
+    """Negative ELBO per object, with q(z) by recognition; with `batch`, rays and the encoder's loss too. And parts.
+
+    Without `solids`, q(z) is the encoder's, and rays are all that there is.
+    """
+    model, recognition = networks
+    k0, k1, k2 = jax.random.split(key, 3)
+    if solids is None:
+        assert batch is not None, "neither solids nor rays"
+        mean, precision = encode(model, batch)
+    else:
+        mean, precision = jax.vmap(lambda o: recognition(description(o)))(solids.objects)
+    z = mean + jax.random.normal(k0, mean.shape) / jnp.sqrt(precision)
+    kl = jnp.mean(jax.vmap(kl_estimate, in_axes=(None, 0, 0, 0))(model, z, mean, precision))
+    weights = jax.vmap(model.hyper)(z)
+    each: tuple | None = None
+    if solids is not None:
+        each = (*shape_samples(solids, k1, config.points), *colour_samples(solids, k2, config.colours))
+    terms, encoder = _solid_terms, jnp.zeros(())
+    if batch is not None:
+        drawn = (batch.origin, batch.direction, batch.ray_rgb, batch.ray_range, batch.ray_weight, batch.turn)
+        terms, each = _ray_terms, (_ObjectRays(*map(jnp.asarray, drawn)), each)
+        encoder = encoder_loss(model, batch, z) if solids is not None else encoder
+    bound = _Bound(terms, (model.field, likelihood, config))
+    fit = jnp.mean(map_with_gradient(bound, config.map_batch, None, each, weights))
+    return kl_weight * kl - fit + encoder, {"fit": fit, "kl": kl, "encoder": encoder}
+
+
+@dataclass(frozen=True)
+class _Bound:
+    """A function with its constants: hashable, as a static argument must be."""
+
+    terms: Callable
+    constants: tuple
+
+    def __call__(self, _: Any, item: Any, weights: Array) -> Array:
+        return self.terms(self.constants, item, weights)
+
+
+class TrainState(eqx.Module):
+    """Everything that a resumed run needs; batches and keys are functions of the step."""
+
+    model: ProbNeRF
+    recognition: Recognition
+    optimiser: optax.OptState
+    step: Array
+
+
+def optimiser_of(config: TrainConfig) -> optax.GradientTransformation:
+    """Adam (paper §2.2) with clipping against the rare bad batch; warm-up and cosine decay in each phase."""
+
+    def schedule(solid: float, ray: float, frozen: int = 0) -> optax.Schedule:
+        first = min(config.solid_steps, config.steps)
+        still = min(frozen, first)
+        parts = [
+            optax.warmup_cosine_decay_schedule(
+                0.0, peak, min(config.warmup, steps // 4), max(steps, 1), config.final_learning_rate
+            )
+            for peak, steps in ((solid, first - still), (ray, config.steps - first))
+        ]
+        return optax.join_schedules([optax.constant_schedule(0.0), *parts], [still, first])
+
+    def named(name: str, network: Any) -> Any:
+        return jax.tree.map(lambda _: name, network)
+
+    def labels(networks: tuple[ProbNeRF, Recognition]) -> tuple[ProbNeRF, Recognition]:
+        model, recognition = networks
+        decoder = eqx.tree_at(lambda m: m.encoder, named("decoder", model), named("encoder", model.encoder))
+        return decoder, named("recognition", recognition)
+
+    rates = {
+        "decoder": optax.adam(schedule(config.learning_rate, config.ray_learning_rate, config.frozen_steps)),
+        "recognition": optax.adam(schedule(config.learning_rate, config.ray_learning_rate)),
+        "encoder": optax.adam(schedule(config.learning_rate, config.learning_rate)),  # idle in the solid phase
+    }
+    return optax.chain(optax.clip_by_global_norm(200.0), optax.multi_transform(rates, labels))
+
+
+def initial_state(model: ProbNeRF, config: TrainConfig) -> TrainState:
+    """A fresh run."""
+    size = description(sample_object(0)).shape[0]
+    key = jax.random.fold_in(jax.random.key(config.seed), 1)
+    recognition = Recognition(size, model.latent, model.preset.hyper_hidden, key)
+    optimiser = optimiser_of(config).init((model, recognition))
+    return TrainState(model, recognition, optimiser, jnp.zeros((), jnp.int32))
+
+
+@eqx.filter_jit(donate="all-except-first")
+def train_step(
+    static: tuple[Likelihood, TrainConfig], state: TrainState, solids: Solids | None, batch: Batch | None
+) -> tuple[TrainState, dict[str, Array]]:
+    """One update: of the solid phase without `batch`."""
+    likelihood, config = static
+    key = jax.random.fold_in(jax.random.key(config.seed), state.step)
+    kl_weight = jnp.clip(state.step / config.kl_warmup, 0.02, 1.0)
+    (value, parts), gradient = jax.value_and_grad(loss, has_aux=True)(
+        (state.model, state.recognition), solids, batch, key, kl_weight, likelihood, config
+    )
+    update, optimiser = optimiser_of(config).update(gradient, state.optimiser)
+    model, recognition = optax.apply_updates((state.model, state.recognition), update)
+    return TrainState(model, recognition, optimiser, state.step + 1), {"loss": value, **parts}
+
+
+def save_checkpoint(path: Path, state: TrainState) -> None:
+    """Atomic: a killed run leaves the old checkpoint or the new one, never half of one."""
+    temporary = path.with_suffix(".tmp")
+    with open(temporary, "wb") as file:
+        eqx.tree_serialise_leaves(file, state)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def train(
+    model: ProbNeRF, solids: Solids | None, views: ViewSet, likelihood: Likelihood, config: TrainConfig, folder: Path
+) -> Iterator[tuple[TrainState, dict[str, float]]]:
+    """Run or resume in `folder`; yields (state, metrics) every `log_every` steps and appends them to history.jsonl.
+
+    `views` are pictures of the first so many objects of `solids`; None trains on pictures alone, with no solid phase.
+    Raises FloatingPointError on a non-finite loss, naming the step; the last checkpoint stays.
+    """
+    if solids is None and config.solid_steps:
+        raise ValueError(f"solid_steps is {config.solid_steps}; it must be 0 where there are pictures alone")
+    if config.steps > config.solid_steps and views.rgb.shape[1] < config.views:
+        raise ValueError(f"--views is {config.views} but objects have {views.rgb.shape[1]} pictures; give no more")
+    folder.mkdir(parents=True, exist_ok=True)
+    checkpoint, history = folder / "checkpoint.eqx", folder / "history.jsonl"
+    state = initial_state(jax.tree.map(jnp.copy, model), config)  # its own buffers: a step gives its inputs away
+    settings = folder / "config.json"
+    described = json.dumps(asdict(config), indent=1)
+    if checkpoint.exists():
+        if settings.exists() and settings.read_text() != described:
+            raise ValueError(f"{folder} holds a run of another recipe: see {settings}, or give a fresh --out")
+        state = eqx.tree_deserialise_leaves(checkpoint, state)
+        lines = history.read_text().splitlines() if history.exists() else []
+        kept = [line for line in lines if json.loads(line)["step"] <= int(state.step)]
+        history.write_text("".join(line + "\n" for line in kept))
+    settings.write_text(described)
+    strata = strata_of(views)
+    start = int(state.step)
+
+    def data_of(step: int) -> tuple[Solids | None, Batch | None]:
+        if solids is None or step >= config.solid_steps:
+            batch = draw_batch(views, strata, config, step, config.ray_batch)
+            return None if solids is None else solids[np.asarray(batch.rows)], batch
+        rng = np.random.default_rng([config.seed, step, 3])
+        return solids[rng.choice(len(solids.point), config.batch, replace=False)], None
+
+    with ThreadPoolExecutor(1) as drawer:  # the next batch is drawn while this one is used
+        coming = drawer.submit(data_of, start)
+        for step in range(start, config.steps):
+            data = coming.result()
+            coming = drawer.submit(data_of, step + 1)
+            state, parts = train_step((likelihood, config), state, *data)
+            done = step + 1
+            if done % config.log_every == 0 or done == config.steps:
+                metrics = {k: float(v) for k, v in parts.items()}
+                if not np.isfinite(metrics["loss"]):
+                    raise FloatingPointError(
+                        f"loss is {metrics['loss']} at step {done}; {checkpoint} holds an earlier step"
+                    )
+                with open(history, "a") as file:
+                    file.write(json.dumps({"step": done, "rays": step >= config.solid_steps, **metrics}) + "\n")
+                if done % config.checkpoint_every == 0 or done == config.steps:
+                    save_checkpoint(checkpoint, state)
+                yield state, {"step": done, **metrics}

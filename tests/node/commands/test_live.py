@@ -1,0 +1,136 @@
+"""The whole node: a camera driver, Farside and a planner in three processes, and a recording that repeats it all."""
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from subprocess import PIPE
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from node.__main__ import main
+from node.commands.config_file import load_config
+from node.commands.live import LiveConfig
+from node.ros.bus import Bus
+from node.ros.bus_config import BusConfig
+from node.ros.messages import HYPOTHESES, NEXT_VIEW, QUERY_REGION, hypotheses_from, make
+from perception.sources.open_source import SHIPPED_LOG
+from perception.sources.recording import Log
+from probnerf.prior.checkpoint import save_prior
+from probnerf.prior.networks import PRESETS, ProbNeRF
+from tests.conftest import ROOT
+from tests.node.commands.test_replay_whole import FEW
+from tests.node.shapes import free_port
+
+LAUNCH = ROOT / "launch"
+
+
+def test_the_launch_file_is_the_defaults() -> None:
+    assert load_config(LAUNCH / "live.yaml", LiveConfig) == LiveConfig()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["nowhere.mcap"], "nowhere.mcap does not exist"),
+        (["oak"], "no OAK camera|oak"),
+        (["webcam:99"], "webcam:99|camera 99"),
+        (["--budget", "0"], "the budget is 0 s; give more than 0"),
+        ([str(SHIPPED_LOG), "--record", "/proc/none/a.mcap"], "/proc/none/a.mcap cannot be written|No such file"),
+    ],
+)
+def test_what_is_not_there_is_one_line(
+    arguments: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    (tmp_path / "live.yaml").write_text("bus: {listen: [tcp/127.0.0.1:0]}")  # another node may run on this machine
+    assert main(["live", *arguments, "--config", str(tmp_path / "live.yaml")]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("farside: error: ") and said.count("\n") == 1 and re.search(says, said)
+
+
+def wait_for(planner: Bus, name: str, kind: str, request: Any, seconds: float = 200.0) -> Any:
+    """The first response that is a success."""
+    until, why = time.monotonic() + seconds, ""
+    while time.monotonic() < until:
+        try:
+            response = planner.call(name, kind, request, timeout_s=5.0)
+        except (OSError, TimeoutError) as error:
+            why = str(error)
+        else:
+            if response.success:
+                return response
+            why = response.message
+        time.sleep(0.2)
+    raise AssertionError(why)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_driver_the_node_and_a_planner_in_three_processes(tmp_path: Path) -> None:
+    save_prior(tmp_path / "tiny.safetensors", ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {})
+    port = free_port()
+    config = tmp_path / "live.yaml"
+    config.write_text(f"bus: {{listen: [tcp/127.0.0.1:{port}]}}\ntrack: {{moved_below: 0.0}}\n{FEW}")
+    log, endpoint = tmp_path / "live.mcap", f"tcp/127.0.0.1:{port}"
+    options = ["--config", str(config), "--prior", str(tmp_path / "tiny.safetensors")]
+    live = [sys.executable, "-m", "node", "live", "topic", "--record", str(log), *options]
+    driver = [sys.executable, "-m", "tests.node.driver", endpoint, str(SHIPPED_LOG), "10"]
+    errors = tmp_path / "errors"  # a file: a pipe that nobody reads would fill and stop the node
+    with (
+        errors.open("w") as stderr,
+        subprocess.Popen(live, cwd=ROOT, stdout=PIPE, stderr=stderr, text=True) as node,
+    ):
+        try:
+            assert "is up" in node.stdout.readline()
+            with (
+                subprocess.Popen(driver, cwd=ROOT, stdout=PIPE, text=True) as camera,
+                Bus(BusConfig(name="planner", connect=(endpoint,))) as planner,
+            ):
+                heard: list = []
+                planner.subscribe("/farside/hypotheses", HYPOTHESES, heard.append)
+                asked = make(f"{QUERY_REGION}_Request", kind=1, points=np.array([0.0, 0.0, 0.4, 0.0, 0.0, 0.7]))
+                asked.header.frame_id = "camera"
+                response = wait_for(planner, "/farside/query_region", QUERY_REGION, asked)
+                assert 0.0 <= response.p_free <= 1.0 and len(response.p_occupied) == 2
+                assert response.objects >= 1 and response.age < 100.0
+                views = make(f"{NEXT_VIEW}_Request", count=3)
+                views.header.frame_id = "camera"
+                ranked = wait_for(planner, "/farside/next_view", NEXT_VIEW, views)
+                assert len(ranked.poses) == 3 and (np.diff(ranked.gain_nats) <= 0).all()
+                until = time.monotonic() + 100.0
+                while (done := _converged(heard)) != {1, 2} and time.monotonic() < until:
+                    time.sleep(0.2)
+                assert done == {1, 2}
+                assert any("/farside" in entity for entity in planner.graph())
+                camera.kill()
+            node.send_signal(signal.SIGINT)
+            said = node.stdout.read()
+            assert node.wait(60.0) == 0, errors.read_text()
+        finally:
+            node.kill()
+    received, _, inferred = (int(n) for n in re.search(r"(\d+) frames, (\d+) looked at, (\d+) inferred", said).groups())
+    recorded = list(Log(log))
+    assert len(recorded) == received and "0 dropped" in said  # every frame that came is in the recording
+    assert inferred >= 2
+    # and the recording repeats what was inferred live
+    again = ["replay", str(log), "--schedule", *_for_replay(options, tmp_path), "--out", str(tmp_path / "out")]
+    # a process of its own: with another number of devices sums are rounded otherwise
+    ended = subprocess.run([sys.executable, "-m", "node", *again], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert f"{inferred} of {inferred} inferences came out as they did" in ended.stdout, ended.stdout
+
+
+def _converged(messages: list) -> set[int]:
+    """The objects of which a last answer came."""
+    return {h.object_id for h in map(hypotheses_from, messages) if h.result == "converged"}
+
+
+def _for_replay(options: list[str], folder: Path) -> list[str]:
+    """The same configuration without what only the live node has."""
+    path = folder / "replay.yaml"
+    path.write_text("\n".join(line for line in Path(options[1]).read_text().splitlines() if not line.startswith("bus")))
+    return ["--config", str(path), *options[2:]]

@@ -1,0 +1,171 @@
+"""Types hash as ROS 2 hashes them, messages are its bytes, and hypotheses survive the way there and back."""
+
+import struct
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from node.ros.messages import (
+    FOLDER,
+    HYPOTHESES,
+    NEXT_VIEW,
+    PARAMETER_SERVICES,
+    QUERY_REGION,
+    decode,
+    encode,
+    header,
+    hypotheses_from,
+    hypotheses_message,
+    make,
+    matrix,
+    pose,
+    register_service,
+    type_hash,
+    types,
+)
+from tests.node.peer import ADD, ADD_TEXT
+from tests.node.shapes import body_with_handle
+
+PARTS = [f"{s}_{part}" for s in (QUERY_REGION, NEXT_VIEW, *PARAMETER_SERVICES) for part in ("Request", "Response")]
+SENT = (
+    "sensor_msgs/msg/PointCloud2",
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/CompressedImage",
+    "sensor_msgs/msg/CameraInfo",
+    "visualization_msgs/msg/MarkerArray",
+    "diagnostic_msgs/msg/DiagnosticArray",
+    "tf2_msgs/msg/TFMessage",
+)
+
+
+def test_hashes_known_from_ros() -> None:
+    assert type_hash(ADD) == "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"
+    string = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+    assert type_hash("std_msgs/msg/String") == string
+    get = "RIHS01_bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc"
+    assert type_hash("rcl_interfaces/srv/GetParameters") == get
+    with pytest.raises(ValueError, match="the type 'std_msgs/msg/Strin' is unknown"):
+        type_hash("std_msgs/msg/Strin")
+
+
+@pytest.mark.parametrize("kind", SENT)
+def test_mending_changes_no_type_without_char(kind: str) -> None:
+    assert type_hash(kind) == get_typestore(Stores.ROS2_JAZZY).hash_rihs01(kind)
+
+
+def test_char_is_hashed_as_uint8() -> None:
+    plain = get_typestore(Stores.ROS2_JAZZY)
+    plain.register(get_types_from_msg("uint8 data\n", "std_msgs/msg/Twin"))
+    twin = plain.hash_rihs01("std_msgs/msg/Twin")
+    plain.fielddefs["std_msgs/msg/Char"] = plain.fielddefs["std_msgs/msg/Twin"]
+    assert plain.hash_rihs01("std_msgs/msg/Char") != twin  # the type's name is hashed, too
+    assert type_hash("std_msgs/msg/Char") == plain.hash_rihs01("std_msgs/msg/Char")
+
+
+def test_our_types_are_those_of_the_files() -> None:
+    """The package lists every file, and a plain typestore gives the message's hash."""
+    cmake = (FOLDER / "CMakeLists.txt").read_text()
+    for path in (*FOLDER.glob("msg/*"), *FOLDER.glob("srv/*")):
+        assert f'"{path.parent.name}/{path.name}"' in cmake
+    plain = get_typestore(Stores.ROS2_JAZZY)
+    text = (FOLDER / "msg" / "ShapeHypotheses.msg").read_text()
+    plain.register(get_types_from_msg(text, HYPOTHESES))
+    assert type_hash(HYPOTHESES) == plain.hash_rihs01(HYPOTHESES)
+    for service in (QUERY_REGION, NEXT_VIEW):
+        assert [name for name, _ in types().fielddefs[service][1]] == [
+            "request_message",
+            "response_message",
+            "event_message",
+        ]
+        assert types().fielddefs[f"{service}_Response"][1][0][0] == "success"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def services() -> None:
+    register_service(ADD, ADD_TEXT)
+
+
+@pytest.mark.parametrize("kind", [*SENT, HYPOTHESES, *PARTS])
+def test_an_empty_message_comes_back(kind: str) -> None:
+    data = encode(make(kind))
+    assert data[:4] == b"\x00\x01\x00\x00"  # CDR, little-endian
+    assert encode(decode(bytes(data), kind)) == data
+    assert data == types().serialize_cdr(make(kind), kind)
+
+
+def test_bytes_are_those_of_cdr() -> None:
+    """Worked by hand: alignment to four bytes, texts with their length and a zero at the end."""
+    by_hand = struct.pack("<iII3sx", 7, 9, 3, b"ab\0")
+    assert bytes(encode(header(7_000_000_009, "ab"))) == b"\x00\x01\x00\x00" + by_hand[:15]
+    assert bytes(encode(make("std_msgs/msg/Empty"))) == b"\x00\x01\x00\x00\x00"
+    assert decode(b"\x00\x01\x00\x00\x00", "std_msgs/msg/Empty") == make("std_msgs/msg/Empty")
+
+
+def test_hypotheses_come_back_whole() -> None:
+    T = np.eye(4)
+    T[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    T[:3, 3] = [1.0, 2.0, 0.5]
+    for h in (body_with_handle(), body_with_handle(T_world_camera=T, out_of_model=True, seed=2**40)):
+        message = hypotheses_message(h, "tempered_smc")
+        assert message.method == "tempered_smc" and message.explained == 0.93
+        back = hypotheses_from(decode(bytes(encode(message)), HYPOTHESES))
+        for field in fields(h):
+            if field.name not in ("object_frame", "T_world_camera"):
+                np.testing.assert_array_equal(getattr(back, field.name), getattr(h, field.name), field.name)
+        np.testing.assert_allclose(back.object_frame.T_camera_object, h.object_frame.T_camera_object, atol=1e-15)
+        np.testing.assert_array_equal(back.object_frame.plane, h.object_frame.plane)
+        for name in ("half_extent", "xy_sigma", "log_scale_sigma"):
+            assert getattr(back.object_frame, name) == getattr(h.object_frame, name)
+        if h.T_world_camera is None:
+            assert back.T_world_camera is None
+        else:
+            np.testing.assert_allclose(back.T_world_camera, h.T_world_camera, atol=1e-15)
+
+
+def test_hypotheses_that_do_not_fit_are_refused() -> None:
+    message = hypotheses_message(body_with_handle())
+    message.opacity = message.opacity[:-1]
+    with pytest.raises(ValueError, match="opacity has 65535 entries; 2 hypotheses of 32 voxels a side need 65536"):
+        hypotheses_from(message)
+    message = hypotheses_message(body_with_handle())
+    message.pose.orientation.w += 0.5
+    with pytest.raises(ValueError, match="quaternion"):
+        hypotheses_from(message)
+
+
+@pytest.mark.parametrize("cut", [0, 3, 4, 20, 60, -1])
+def test_bytes_cut_short_are_refused(cut: int) -> None:
+    data = bytes(encode(hypotheses_message(body_with_handle())))
+    with pytest.raises(ValueError, match="bytes are no farside_msgs/msg/ShapeHypotheses"):
+        decode(data[:cut], HYPOTHESES)
+
+
+def test_random_bytes_are_refused_or_read() -> None:
+    """Whatever comes, there is a message or one kind of error."""
+    rng = np.random.default_rng(0)
+    refused = 0
+    for _ in range(300):
+        data = b"\x00\x01\x00\x00" + rng.integers(0, 256, int(rng.integers(0, 200)), dtype=np.uint8).tobytes()
+        for kind in ("sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", f"{QUERY_REGION}_Request"):
+            try:
+                decode(data, kind)
+            except ValueError:
+                refused += 1
+    assert refused > 500
+
+
+def test_make_names_a_field_that_is_not_there() -> None:
+    with pytest.raises(ValueError, match="std_msgs/msg/String has no field text; it has data"):
+        make("std_msgs/msg/String", text="a")
+
+
+def test_a_pose_turns_as_its_matrix() -> None:
+    h = body_with_handle()
+    np.testing.assert_allclose(matrix(pose(h.object_frame.T_camera_object)), h.object_frame.T_camera_object, atol=1e-15)
+    quarter = np.eye(4)
+    quarter[:2, :2] = [[0, -1], [1, 0]]  # about z, by ROS: (0, 0, sin 45, cos 45)
+    q = pose(quarter).orientation
+    np.testing.assert_allclose(np.abs([q.x, q.y, q.z, q.w]), [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-15)
+    assert q.z * q.w > 0

@@ -1,0 +1,69 @@
+"""A node announces each scene to whoever listens, and to a late joiner its hypotheses."""
+
+import time
+from typing import Any
+
+import numpy as np
+
+from calibration.camera import Camera
+from node.ros.bus import Bus
+from node.ros.bus_config import BusConfig
+from node.ros.messages import HYPOTHESES, hypotheses_from
+from node.ros.publishers import Announcer
+from node.ros.scene_messages import Status
+from node.ros.topic_source import TopicConfig, TopicSource
+from perception.sources.frame import Frame
+from tests.node.shapes import body_with_handle
+
+CAMERA = Camera(160, 120, np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]), np.zeros(5))
+TOPICS = {
+    "~/hypotheses": HYPOTHESES,
+    "~/occupancy": "sensor_msgs/msg/PointCloud2",
+    "~/markers": "visualization_msgs/msg/MarkerArray",
+    "~/uncertainty": "sensor_msgs/msg/Image",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "/tf": "tf2_msgs/msg/TFMessage",
+}
+
+
+def test_every_topic_carries_the_scene() -> None:
+    scene = [body_with_handle(), body_with_handle(object_id=2)]
+    came: dict[str, list[Any]] = {name: [] for name in TOPICS}
+    with Bus(BusConfig(namespace="/robot")) as bus:
+        announcer = Announcer(bus)
+        assert announcer.node == "/robot/farside"
+        for name, kind in TOPICS.items():
+            bus.subscribe(name, kind, came[name].append)
+        announcer.scene(scene, CAMERA, "tempered_smc")
+        announcer.status(scene, [Status("farside: camera", "ok", "", {"rate (Hz)": 10.0})])
+        late: list[Any] = []
+        bus.subscribe("~/hypotheses", HYPOTHESES, late.append, latched=True)
+        deadline = time.monotonic() + 20.0
+        while (not all(came.values()) or len(late) < 2) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        for messages in (came["~/hypotheses"], late):
+            assert [hypotheses_from(m).object_id for m in messages] == [1, 2]
+        assert came["~/hypotheses"][0].method == "tempered_smc"
+        assert len(came["/tf"][0].transforms) == 2
+        names = [status.name for status in came["/diagnostics"][0].status]
+        assert names == ["farside: camera", "farside: object 1", "farside: object 2", "farside: bus"]
+        announcer.scene([], CAMERA)  # says nothing
+        assert not {"~/occupancy", "~/markers", "~/uncertainty"} - {name for name in came if len(came[name]) == 1}
+
+
+def test_a_frame_comes_back_from_the_bus() -> None:
+    """What the node sends of its camera, a topic source takes for the same frame."""
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 256, (120, 160, 3), dtype=np.uint8)
+    depth = rng.uniform(0.2, 2.0, (120, 160)).astype(np.float32)
+    depth[:5] = np.nan
+    sent = Frame(1_700_000_000_123_456_789, "oak", rgb, depth, None, CAMERA)
+    topics = TopicConfig("~/color/image_raw", "~/depth/image_raw", "~/color/camera_info", end_s=20.0)
+    with Bus(BusConfig()) as bus:
+        source, announcer = TopicSource(bus, topics), Announcer(bus)
+        announcer.frame(sent)
+        came = next(iter(source))
+    assert (came.stamp_ns, came.frame_id) == (sent.stamp_ns, sent.frame_id)
+    np.testing.assert_array_equal(came.rgb, sent.rgb)
+    np.testing.assert_array_equal(came.depth, sent.depth)
+    np.testing.assert_array_equal(came.camera.K, CAMERA.K)

@@ -1,0 +1,146 @@
+"""A camera driver's topics become Frames, exactly; what does not fit is left out and said."""
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from node.ros.bus import Bus
+from node.ros.bus_config import BusConfig
+from node.ros.messages import header, make
+from node.ros.topic_source import TopicConfig, TopicSource
+
+WIDTH, HEIGHT, MS = 32, 24, 1_000_000
+COLOUR, DEPTH, INFO = "/cam/color/image_raw", "/cam/depth/image_raw", "/cam/color/camera_info"
+START = 1_700_000_000_000_000_000
+
+
+def picture(seed: int, shape: tuple[int, ...] = (HEIGHT, WIDTH, 3)) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+
+
+def image(stamp: int, array: np.ndarray, encoding: str) -> Any:
+    return make(
+        "sensor_msgs/msg/Image",
+        header=header(stamp, "cam_optical"),
+        height=array.shape[0],
+        width=array.shape[1],
+        encoding=encoding,
+        step=array.strides[0],
+        data=np.ascontiguousarray(array).view(np.uint8).ravel(),
+    )
+
+
+class Driver:
+    """Publishes as a camera driver does."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.colour = bus.publisher(COLOUR, "sensor_msgs/msg/Image")
+        self.packed = bus.publisher(f"{COLOUR}/compressed", "sensor_msgs/msg/CompressedImage")
+        self.depth = bus.publisher(DEPTH, "sensor_msgs/msg/Image")
+        self.info = bus.publisher(INFO, "sensor_msgs/msg/CameraInfo")
+
+    def say_info(self, width: int = WIDTH) -> None:
+        K = np.array([30.0, 0, 15.5, 0, 30.0, 11.5, 0, 0, 1])
+        P = np.array([40.0, 0, 15.5, 0, 0, 40.0, 11.5, 0, 0, 0, 1, 0])
+        d = np.array([0.1, 0, 0, 0, 0])
+        size: dict = {"height": HEIGHT, "width": width}
+        size |= {"distortion_model": "plumb_bob", "d": d, "k": K, "p": P}
+        self.info.publish(make("sensor_msgs/msg/CameraInfo", header=header(START, "cam_optical"), **size))
+
+    def say(self, i: int, late_ns: int = 0, shape: tuple[int, ...] = (HEIGHT, WIDTH, 3)) -> None:
+        stamp = START + i * 33 * MS
+        self.colour.publish(image(stamp, picture(i, shape), "rgb8"))
+        self.depth.publish(image(stamp + late_ns, np.full((HEIGHT, WIDTH), 500 + i, np.uint16), "16UC1"))
+
+
+@pytest.fixture
+def bus() -> Iterator[Bus]:
+    with Bus(BusConfig(), lambda line: None) as bus:
+        yield bus
+
+
+def wait_for(bus: Bus, count: int) -> None:
+    """Until so many images of each kind were taken."""
+    deadline = time.monotonic() + 20.0
+    while min(bus.counts.of(name).get("received", 0) for name in (COLOUR, DEPTH)) < count:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def config(**changes) -> TopicConfig:
+    return TopicConfig(**{"colour": COLOUR, "depth": DEPTH, "info": INFO, "end_s": 10.0, **changes})
+
+
+def test_frames_are_what_the_driver_sent(bus: Bus) -> None:
+    source, driver = TopicSource(bus, config()), Driver(bus)
+    frames = iter(source)
+    driver.say_info()
+    for i in range(3):
+        driver.say(i, late_ns=4 * MS)
+        frame = next(frames)
+        assert (frame.stamp_ns, frame.frame_id) == (START + i * 33 * MS, "cam_optical")
+        np.testing.assert_array_equal(frame.rgb, picture(i))
+        np.testing.assert_allclose(frame.depth, 0.5 + 0.001 * i, rtol=1e-6)
+        assert frame.camera.K[0, 0] == 30.0 and frame.camera.distortion[0] == 0.1
+    source.close()
+    assert list(frames) == [] and source.notes == [] and source.dropped == 0
+    assert source.live
+
+
+def test_compressed_and_rectified_without_depth(bus: Bus) -> None:
+    source, driver = TopicSource(bus, config(colour=f"{COLOUR}/compressed", depth=None, rectified=True)), Driver(bus)
+    driver.say_info()
+    png = cv2.imencode(".png", picture(5)[..., ::-1])[1].ravel()
+    packed = make(
+        "sensor_msgs/msg/CompressedImage", header=header(START, "cam"), format="rgb8; png compressed bgr8", data=png
+    )
+    driver.packed.publish(packed)
+    frame = next(iter(source))
+    np.testing.assert_array_equal(frame.rgb, picture(5))
+    assert frame.depth is None and frame.camera.K[0, 0] == 40.0 and not frame.camera.distortion.any()
+
+
+def test_a_colour_without_its_depth_is_dropped(bus: Bus) -> None:
+    source, driver = TopicSource(bus, config(waiting=2, end_s=0.5)), Driver(bus)
+    driver.say_info()
+    for i in range(6):
+        driver.say(i, late_ns=15 * MS)  # 15 ms to its own and 18 ms to the next
+        wait_for(bus, i + 1)
+    assert list(source) == [] and source.dropped == 6
+    assert "dropped for want of depth within 10 ms (the nearest was 15.0 ms" in source.notes[0]
+
+
+def test_only_the_newest_frame_waits(bus: Bus) -> None:
+    source, driver = TopicSource(bus, config()), Driver(bus)
+    driver.say_info()
+    for i in range(5):
+        driver.say(i)
+        wait_for(bus, i + 1)
+    assert next(iter(source)).stamp_ns == START + 4 * 33 * MS and source.skipped == 4
+
+
+@pytest.mark.parametrize("wrong", ["image", "info"])
+def test_a_wrong_size_is_said(bus: Bus, wrong: str) -> None:
+    source, driver = TopicSource(bus, config(end_s=0.6)), Driver(bus)
+    driver.say_info(WIDTH if wrong == "image" else 2 * WIDTH)
+    driver.say(0, shape=(HEIGHT, WIDTH // 2, 3) if wrong == "image" else (HEIGHT, WIDTH, 3))
+    assert list(source) == []
+    sizes = "16x24" if wrong == "image" else "64x24"
+    assert len(source.notes) == 1 and sizes in source.notes[0] and source.notes[0].startswith("frames are left out: ")
+
+
+def test_silence_is_said_with_the_topics_that_are_missing(bus: Bus) -> None:
+    source, driver = TopicSource(bus, config(silence_s=0.3, end_s=0.8)), Driver(bus)
+    driver.say_info()
+    assert list(source) == []
+    assert len(source.notes) == 1
+    assert f"nothing came on {COLOUR}, {DEPTH}; is the driver up" in source.notes[0]
+
+
+def test_configuration_is_checked() -> None:
+    with pytest.raises(ValueError, match="silence_s be positive"):
+        TopicConfig(silence_s=0.0)

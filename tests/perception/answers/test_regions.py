@@ -1,0 +1,83 @@
+"""A mesh as a region: what it fills is asked, whole, and a file that is none is named."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from perception.answers.query import query
+from perception.answers.regions import Cells, Swept, read_mesh
+from tests.perception.answers.test_query import LEFT, RIGHT, VOXEL, _swept, mug
+
+__all__ = ["mug"]  # the fixture
+
+
+def _saved(path: Path, mesh: trimesh.Trimesh) -> Path:
+    mesh.export(path)
+    return path
+
+
+def _box(low: tuple[float, ...], high: tuple[float, ...], margin: float = 0.0) -> trimesh.Trimesh:
+    return trimesh.creation.box(bounds=np.array([np.add(low, margin), np.subtract(high, margin)]))
+
+
+@pytest.mark.parametrize("kind", ["obj", "stl", "ply", "glb"])
+def test_a_mesh_answers_as_the_box_it_is(mug, tmp_path: Path, kind: str) -> None:
+    width = 0.25 * VOXEL
+    mesh = _box(*LEFT, margin=0.5 * width)  # cells that the surface meets count whole
+    found = query([mug], read_mesh(_saved(tmp_path / f"grasp.{kind}", mesh), width), "object")
+    same = query([mug], _swept(LEFT), "object")
+    assert found.p_free == same.p_free == pytest.approx(0.7)
+    assert found.volume_m3["q95"] == pytest.approx(same.volume_m3["q95"], rel=0.15)
+    assert found.unseen_fraction == pytest.approx(same.unseen_fraction, abs=0.05) and found.outside_fraction == 0.0
+
+
+def test_a_mesh_is_filled_and_says_which_hypotheses_are_in_its_way(mug, tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(radius=0.05)
+    ball.apply_translation([-0.07, 0.0, 0.0])  # about the right handle's place, whose surface no handle meets
+    found = query([mug], read_mesh(_saved(tmp_path / "ball.obj", ball), 0.5 * VOXEL), "object")
+    assert found.blocked_by == {1: [0, 1]}  # the body, too
+    handle = trimesh.creation.icosphere(radius=0.015)
+    handle.apply_translation([-0.07, 0.0, 0.0])
+    cells = read_mesh(_saved(tmp_path / "small.stl", handle), 0.5 * VOXEL)
+    found = query([mug], cells, "object")
+    assert found.p_free == pytest.approx(0.3) and found.blocked_by == {1: [1]}
+    volume = len(cells.centres) * cells.width**3
+    assert 1.0 < volume / (4 / 3 * np.pi * 0.015**3) < 2.5
+    nothing = query([mug], _swept(((0.0, 0.1, 0.0), (0.02, 0.12, 0.02))), "object")
+    assert nothing.p_free == 1.0 and nothing.blocked_by == {}
+
+
+def test_cells_wider_than_voxels_miss_none(mug) -> None:
+    middle = 0.5 * np.add(*RIGHT)
+    wide = Cells(middle[None], 3.0 * VOXEL)
+    box = Swept(np.eye(4)[None] + np.pad(middle[None, :, None], ((0, 0), (0, 1), (3, 0))), np.full((1, 3), 3 * VOXEL))
+    assert query([mug], wide, "object").volume_m3 == pytest.approx(query([mug], box, "object").volume_m3)
+
+
+def test_what_is_no_mesh_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"absent\.obj: no such file"):
+        read_mesh(tmp_path / "absent.obj", 0.01)
+    (tmp_path / "cut.glb").write_bytes(b"glTF")
+    (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 1\n")
+    (tmp_path / "nan.obj").write_text("v nan 0 0\nv 1 0 0\nv 0 1 1\nf 1 2 3\n")
+    (tmp_path / "words.txt").write_text("no mesh")
+    for name, complaint in {
+        "cut.glb": "cannot be read as a mesh",
+        "points.obj": "holds no triangles",
+        "nan.obj": r"vertex 1 is \[nan, 0.0, 0.0\]",
+        "words.txt": "cannot be read as a mesh",
+    }.items():
+        with pytest.raises(ValueError, match=complaint):
+            read_mesh(tmp_path / name, 0.01)
+    whole = _box((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))  # one vertex that is none would not be missed, but for this
+    lines = _saved(tmp_path / "box.obj", whole).read_text().splitlines()
+    at = next(i for i, line in enumerate(lines) if line.startswith("v "))
+    (tmp_path / "part.obj").write_text("\n".join([*lines[:at], "v nan nan nan", *lines[at + 1 :]]))
+    with pytest.raises(ValueError, match="vertex 1 is"):
+        read_mesh(tmp_path / "part.obj", 0.01)
+    with pytest.raises(ValueError, match="is it in metres"):
+        read_mesh(_saved(tmp_path / "mm.stl", trimesh.creation.box((300.0, 300.0, 300.0))), 0.0025)
+    with pytest.raises(ValueError, match="more than 0"):
+        Cells(np.zeros((1, 3)), 0.0)

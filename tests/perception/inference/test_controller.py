@@ -1,0 +1,129 @@
+"""The controller: what makes the model grow, what stops it, and that a cut leaves the answer before it standing."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from math import inf
+
+import numpy as np
+import pytest
+
+from perception.answers.hypotheses import Hypotheses
+from perception.inference.controller import ControllerConfig, Estimate, estimate
+from perception.inference.warm_up import _alone
+from perception.observation.segmentation import Segment, segment
+from perception.sources.open_source import SHIPPED_LOG
+from perception.sources.recording import Log
+from probnerf.inference import InferConfig, quick_smc
+from probnerf.prior.checkpoint import load_prior
+from tests.perception.inference.test_tracker import frame_from
+
+CONFIG = ControllerConfig(
+    # no climbs, which cost the same however many runs
+    infer=InferConfig(smc_from_prior=replace(quick_smc(2, 10), start_particles=40), encoder_starts=False),
+    hypotheses=8,
+    first_hypotheses=4,
+    grid=32,
+    runs=4,
+)
+
+
+def answers_of(config: ControllerConfig, stages: int | None = None) -> tuple[Estimate, list[Hypotheses]]:
+    frame, told = frame_from(0.0), list[Hypotheses]()
+    found = estimate(
+        frame, segment(frame)[0], load_prior(), config, seed=3, stages=stages, on_answer=told.append
+    )  # fmt: skip
+    return found, told
+
+
+@pytest.mark.slow
+def test_where_little_is_asked_one_run_is_all() -> None:
+    found, told = answers_of(replace(CONFIG, unexplained=1.0, tolerance=inf))
+    assert len(found.log) == 1 and found.log[0].startswith("2 x 10 particles: expected loss")
+    assert found.hypotheses is told[-1] and found.hypotheses.result == "converged"
+    assert all(h.result == "underway" for h in told[:-1]) and len(told[0].weights) == CONFIG.first_hypotheses
+    assert found.posterior.positions.shape[0] == 20
+    assert found.parts.keys() >= {"sampling", "publishing"} and min(found.parts.values()) > 0.0
+    assert 0.5 * found.seconds < sum(found.parts.values()) <= found.seconds
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limits", [{"unexplained": 0.0, "tolerance": inf}, {"unexplained": 1.0, "tolerance": 0.0}])
+def test_unexplained_pixels_take_all_runs_and_so_does_error(limits: dict[str, float]) -> None:
+    small, _ = answers_of(replace(CONFIG, unexplained=1.0, tolerance=inf))
+    found, told = answers_of(replace(CONFIG, **limits))
+    assert [line.split(": expected loss")[0] for line in found.log] == ["2 x 10 particles", "8 x 10 particles"]
+    assert found.log[0].endswith("-> 8 x 10 particles") and "->" not in found.log[1]
+    h = found.hypotheses
+    assert h.result == "converged" and len(np.unique(h.population)) + h.diagnostics["failed_populations"] == 8
+    assert found.posterior.positions.shape[0] == 80
+    assert h.diagnostics["point_gradients"] > 2.5 * small.hypotheses.diagnostics["point_gradients"]
+    assert float(np.exp(np.asarray(found.posterior.log_weights, np.float64)).sum()) == pytest.approx(1.0, abs=1e-4)
+    # the first run's answer came in full, and after it none that was underway but whole ones
+    full = [len(t.weights) == CONFIG.hypotheses for t in told]
+    assert full[full.index(True) :] == [True] * 2
+
+
+@pytest.mark.slow
+def test_a_cut_leaves_the_runs_before_it_and_repeats_bit_for_bit() -> None:
+    config = replace(CONFIG, tolerance=0.0)
+    small, _ = answers_of(replace(CONFIG, unexplained=1.0, tolerance=inf))
+    stages = small.hypotheses.stage + 2
+    found, _ = answers_of(config, stages)
+    assert found.hypotheses.result == found.posterior.result == "stages" and found.hypotheses.stage == stages
+    assert found.log[-1] == "no room for more (stages)"
+    np.testing.assert_array_equal(found.hypotheses.opacity, small.hypotheses.opacity)
+    again, _ = answers_of(config, stages)
+    np.testing.assert_array_equal(again.hypotheses.opacity, found.hypotheses.opacity)
+    exact, _ = answers_of(config, small.hypotheses.stage)
+    assert exact.hypotheses.result == "stages" and exact.hypotheses.stage == small.hypotheses.stage
+
+
+@pytest.mark.slow
+def test_a_cut_between_later_runs_keeps_all_that_are_whole() -> None:
+    config = replace(CONFIG, tolerance=0.0)
+    each = [answers_of(replace(config, runs=runs))[0].hypotheses.stage for runs in (2, 3)]
+    found, _ = answers_of(config, (each[0] + each[1]) // 2)
+    assert found.hypotheses.result == "stages" and found.posterior.positions.shape[0] == 40
+    assert len(np.unique(found.hypotheses.population)) + found.hypotheses.diagnostics["failed_populations"] == 4
+    assert found.log[1].startswith("4 x 10 particles: expected loss") and found.log[2] == "no room for more (stages)"
+
+
+@pytest.mark.parametrize(
+    ("done", "loss", "missed", "needed"),
+    [
+        (1, 0.009, 0.0, 1),  # good enough
+        (1, 0.029, 0.0, 3),  # 2.9 rounded up
+        (4, 0.0101, 0.0, 5),
+        (1, 0.5, 0.0, 6),  # all there may be
+        (1, 0.009, 0.2, 6),
+        (6, 0.5, 0.2, 6),
+        (1, float("nan"), 0.0, 6),
+    ],
+)
+def test_how_many_runs_a_loss_takes(done: int, loss: float, missed: float, needed: int) -> None:
+    assert ControllerConfig(tolerance=0.01, unexplained=0.1, runs=6).needed(done, loss, missed) == needed
+    assert ControllerConfig(tolerance=inf, unexplained=1.0, runs=6).needed(done, loss, missed) == done
+
+
+def test_no_runs_are_refused() -> None:
+    with pytest.raises(ValueError, match="runs 0"):
+        ControllerConfig(runs=0)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_two_threads_ask_at_once_and_both_are_answered() -> None:
+    """From modes and from the prior at once: on two cores the library of eigenvalues would wait for ever, each for the
+    thread that the other holds.
+    """
+    frame, prior = next(iter(Log(SHIPPED_LOG))), load_prior()
+    hidden = segment(frame)[0]
+    both = (_alone(hidden), hidden)
+
+    def opacity(seen: Segment) -> np.ndarray:
+        return estimate(frame, seen, prior, stages=6).hypotheses.opacity
+
+    expected = [opacity(seen) for seen in both]
+    with ThreadPoolExecutor(2) as threads:
+        found = list(threads.map(opacity, both))
+    np.testing.assert_array_equal(found, expected)

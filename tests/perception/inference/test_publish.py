@@ -1,0 +1,62 @@
+"""Of which voxels of a cube shapes are asked, and what few populations lose."""
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from perception.inference.publish import expected_loss
+from perception.observation.rays import observe
+from perception.observation.segmentation import segment
+from perception.observation.visibility import answered_voxels, seen_voxels
+from probnerf.rendering.occupancy import voxel_centres
+from tests.perception.cylinders import CAN, looking_down, picture
+
+
+def test_all_is_asked_but_space_seen_free_well_before_the_surface() -> None:
+    T = looking_down(35.0)
+    frame = picture(CAN, T=T)
+    (found,) = segment(frame)
+    cube = observe(frame, found)[1]
+    asked, seen = answered_voxels(frame, found, cube, 64), seen_voxels(frame, found, cube, 64)
+    assert asked[~seen].all() and not asked.all()
+    points = (cube.to_camera(voxel_centres(64).astype(np.float64)) @ T[:3, :3].T) + T[:3, 3]
+    beside = np.hypot(points[..., 0] - CAN.x, points[..., 1] - CAN.y) - CAN.radius
+    above = points[..., 2] - CAN.height
+    voxel = 2 * cube.half_extent / 64
+    body = (np.maximum(beside, above) <= 0.0) & (points[..., 2] > 0)
+    assert (body & seen).any() and asked[body].all()  # also where its wall is seen
+    over = (above > 4 * voxel) & seen  # the camera looks down on the top
+    assert over.any() and not asked[over].all()
+    assert (~asked).mean() > 0.15
+
+
+def _voxel(p: np.ndarray) -> SimpleNamespace:
+    """One voxel, of which each population has its own probability: that weight on a full shape, the rest on none."""
+    return SimpleNamespace(
+        population=np.repeat(np.arange(len(p)), 2),
+        weights=np.stack([p, 1.0 - p], axis=1).ravel() / len(p),
+        solid=np.tile([True, False], len(p)).reshape(-1, 1, 1, 1),
+        seen=np.zeros((1, 1, 1), bool),
+    )
+
+
+@pytest.mark.parametrize("populations", [4, 8, 32])
+def test_the_expected_loss_is_what_the_log_score_loses_by_few_populations(populations: int) -> None:
+    rng, everywhere = np.random.default_rng(0), np.ones((1, 1, 1), bool)
+    told, lost = [], []
+    for _ in range(2000):
+        p = rng.beta(2.0, 3.0, populations)  # of mean 0.4, which is right
+        told.append(expected_loss(cast(Any, _voxel(p)), everywhere))
+        q = p.mean()
+        lost.append(0.4 * np.log(0.4 / q) + 0.6 * np.log(0.6 / (1.0 - q)))
+    assert np.mean(told) == pytest.approx(np.mean(lost), rel=0.12)
+
+
+def test_populations_that_agree_lose_nothing_and_one_cannot_tell() -> None:
+    everywhere = np.ones((1, 1, 1), bool)
+    assert expected_loss(cast(Any, _voxel(np.full(3, 0.4))), everywhere) == pytest.approx(0.0, abs=1e-7)
+    assert expected_loss(cast(Any, _voxel(np.array([0.0, 0.0]))), everywhere) == 0.0
+    assert expected_loss(cast(Any, _voxel(np.array([0.0, 1.0]))), everywhere) == pytest.approx(0.5)
+    assert np.isnan(expected_loss(cast(Any, _voxel(np.array([0.4]))), everywhere))
