@@ -25,9 +25,17 @@ MAX_VIEWS = 100
 class Scene:
     """The hypotheses of one picture's objects, as one."""
 
-    objects: tuple[Hypotheses, ...]
-    stamp_ns: int
-    stage: int  # the least of the objects'
+    objects: tuple[Hypotheses, ...]  # at least one
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of the (oldest) picture."""
+        return min(h.stamp_ns for h in self.objects)
+
+    @property
+    def stage(self) -> int:
+        """The least of the objects'."""
+        return min(h.stage for h in self.objects)
 
 
 class Answers:
@@ -42,8 +50,7 @@ class Answers:
         """Put a scene in place of the last. What answers need of it is computed before, so that they do not wait."""
         for h in objects:
             _ = h.p_occupied, h.twins  # cached; p_occupied fills `solid`
-        stamp, stage = min((h.stamp_ns for h in objects), default=0), min((h.stage for h in objects), default=0)
-        self._scene = Scene(tuple(objects), stamp, stage) if objects else None
+        self._scene = Scene(tuple(objects)) if objects else None
 
     @property
     def scene(self) -> Scene:
@@ -59,7 +66,8 @@ class Answers:
 
     def query_region(self, request: Any) -> Any:
         """Answer a farside_msgs/QueryRegion request. Raises ValueError in one line for what cannot be asked."""
-        scene, objects = self._asked(request)
+        scene = self._asked(request)
+        objects = scene.objects
         found = query(objects, _region(request), self._frame(request.header.frame_id, objects))
         blocked = np.array([(o, row) for o, rows in found.blocked_by.items() for row in rows], np.int64).reshape(-1, 2)
         return make(
@@ -86,7 +94,8 @@ class Answers:
 
         Poses are turned into the first object's frame and back.
         """
-        scene, objects = self._asked(request)
+        scene = self._asked(request)
+        objects = scene.objects
         T_object_frame = objects[0].T_object_from(self._frame(request.header.frame_id, objects))
         given = len(request.candidates)
         if max(given, request.count) > MAX_VIEWS:
@@ -103,22 +112,30 @@ class Answers:
             gain_nats=np.asarray(ranked.gain_nats, np.float64),
         )
 
-    def _asked(self, request: Any) -> tuple[Scene, tuple[Hypotheses, ...]]:
+    def _asked(self, request: Any) -> Scene:
+        """The newest scene, or the one object of it that a request names."""
         scene = self.scene
         if not request.object_id:
-            return scene, scene.objects
+            return scene
         if chosen := tuple(h for h in scene.objects if h.object_id == request.object_id):
-            return scene, chosen
+            return Scene(chosen)
         known = ", ".join(str(h.object_id) for h in scene.objects)
         raise ValueError(f"there is no object {request.object_id}; there are {known} (0: all together)")
 
     def _frame(self, name: str, objects: Sequence[Hypotheses]) -> FrameName:
-        """Which of our frames a request means by a frame_id."""
+        """Which of our frames a request means by a frame_id. Raises ValueError for another one, and for an object's
+        frame where several objects are asked together.
+        """
         own = [object_frame_id(self.node, h.object_id) for h in objects]
         aliases: dict[str, FrameName] = {"object": "object", "camera": "camera", "world": "world"}
         aliases |= {objects[0].frame_id: "camera", **dict.fromkeys(own, "object")}
         if name not in aliases:
             raise ValueError(f"frame_id is {name!r}; give one of {', '.join(aliases)}")
+        if aliases[name] == "object" and len(objects) > 1:
+            raise ValueError(
+                f"frame_id {name!r} is ambiguous with {len(objects)} objects; give the object_id of one,"
+                " or ask in the frame camera or world"
+            )
         return aliases[name]
 
 

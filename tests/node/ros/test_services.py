@@ -3,7 +3,7 @@
 import sys
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
@@ -17,6 +17,7 @@ from node.ros.parameters import flat, serve_parameters
 from node.ros.services import BOX, POINTS, SWEPT, Answers
 from perception.answers.query import query
 from perception.answers.regions import Box, Points
+from probnerf.geometry import look_at
 from tests.node.shapes import BODY, LEFT, RIGHT, STAMP_NS, body_with_handle
 
 
@@ -147,6 +148,60 @@ def test_views_are_ranked_in_the_frame_of_the_question(answers: Answers, monkeyp
     assert len(answers.next_view(make(f"{NEXT_VIEW}_Request", header=header(0, "object"))).poses) == 5
     with pytest.raises(ValueError, match="101 views are too many"):
         answers.next_view(make(f"{NEXT_VIEW}_Request", header=header(0, "object"), count=101))
+
+
+def two_objects() -> Answers:
+    """Objects 1 and 2, which stand 30 cm apart."""
+    first, second = body_with_handle(T_world_camera=np.eye(4)), body_with_handle(object_id=2, T_world_camera=np.eye(4))
+    T = second.object_frame.T_camera_object.copy()
+    T[0, 3] += 0.3
+    answers = Answers()
+    answers.update([first, replace(second, object_frame=replace(second.object_frame, T_camera_object=T), stage=2)])
+    return answers
+
+
+def views(frame: str, object_id: int = 0, *places: np.ndarray) -> Any:
+    candidates = [pose(T) for T in places]
+    return make(f"{NEXT_VIEW}_Request", header=header(0, frame), object_id=object_id, candidates=candidates)
+
+
+@pytest.mark.parametrize("frame", ["object", "farside/object_1", "farside/object_2"])
+def test_an_objects_frame_is_ambiguous_where_several_are_asked(frame: str) -> None:
+    answers = two_objects()
+    for service, request in ((answers.next_view, views(frame)), (answers.query_region, ask(frame, **box(*RIGHT)))):
+        with pytest.raises(ValueError, match=f"'{frame}' is ambiguous with 2 objects; give the object_id of one"):
+            service(request)
+
+
+@pytest.mark.parametrize("frame", ["object", "farside/object_2"])
+def test_the_second_object_is_asked_in_its_own_frame(frame: str) -> None:
+    """Views and regions of object 2's frame are those of the camera's, turned."""
+    answers = two_objects()
+    T = answers.scene.objects[1].object_frame.T_camera_object
+    places = [look_at(np.array(at), np.zeros(3)).astype(np.float64) for at in ((0.5, 0, 0.2), (0.0, 0.5, 0.1))]
+    own, camera = (
+        answers.next_view(r) for r in (views(frame, 2, *places), views("camera", 2, *(T @ p for p in places)))
+    )
+    np.testing.assert_allclose([T @ matrix(p) for p in own.poses], [matrix(p) for p in camera.poses], atol=1e-6)
+    np.testing.assert_allclose(own.gain_nats, camera.gain_nats, atol=1e-6)
+    assert own.gain_nats[0] > 0
+    assert {tuple(np.round(matrix(p)[:3, 3], 6)) for p in own.poses} == {(0.5, 0, 0.2), (0.0, 0.5, 0.1)}
+    ring = answers.next_view(views(frame, 2))
+    distances = [np.linalg.norm(matrix(p)[:3, 3]) for p in ring.poses]
+    np.testing.assert_allclose(distances, np.linalg.norm(T[:3, 3]), rtol=1e-6)  # about object 2
+    inside = [oriented(T, (0.02, 0.02, 0.02))]
+    assert answers.query_region(ask("camera", SWEPT, object_id=2, boxes=inside)).p_free == 0.0
+    assert answers.query_region(ask("camera", SWEPT, object_id=1, boxes=inside)).p_free == 1.0
+    assert answers.query_region(ask(frame, object_id=2, **box(*RIGHT))).p_free == pytest.approx(0.3)
+    with pytest.raises(ValueError, match="frame_id is 'farside/object_1'"):
+        answers.next_view(views("farside/object_1", 2))
+
+
+def test_an_answer_tells_the_stage_of_the_objects_asked() -> None:
+    answers = two_objects()
+    for object_id, stage in ((0, 2), (1, 4), (2, 2)):
+        asked = ask("camera", object_id=object_id, **box((-1, -1, 0), (1, 1, 1)))
+        assert answers.query_region(asked).stage == answers.next_view(views("camera", object_id)).stage == stage
 
 
 def test_over_the_bus_while_scenes_change() -> None:
