@@ -15,6 +15,8 @@ from perception.sources.frame import Frame
 from probnerf.geometry import rigid
 
 DEPTH_UNIT_M = 1e-4  # of the depth.png that is written; 1 mm where that does not reach far enough
+# Keys of meta.json, and their shapes, for the camera's K_std, distortion_std and rms.
+_DEVIATIONS: dict[str, tuple[int, ...]] = {"camera_matrix_std_px": (3, 3), "distortion_std": (-1,), "rms_px": ()}
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 
 
@@ -22,9 +24,10 @@ def read_frame_folder(path: Path | str) -> Frame:
     """The frame in a folder: color.png, meta.json, and depth.png (16 bit, 0 for unknown) and label.png where they are.
 
     meta.json gives `camera_matrix_px` (3x3) and `depth_unit_m` (m per count), and may give `distortion` and
-    `distortion_model` (as `Camera`; none by default), `stamp_ns` (0), `frame_id` ("camera") and `T_world_camera` (4x4,
-    m); whatever else it holds is not read. With neither depth.png nor depth_unit_m it is a frame without depth. Raises
-    `FileNotFoundError` or `ValueError` naming the file and the remedy.
+    `distortion_model` (as `Camera`; none by default), what its calibration knows of their errors
+    (`camera_matrix_std_px`, `distortion_std`, `rms_px`), `stamp_ns` (0), `frame_id` ("camera") and `T_world_camera`
+    (4x4, m); whatever else it holds is not read. With neither depth.png nor depth_unit_m it is a frame without depth.
+    Raises `FileNotFoundError` or `ValueError` naming the file and the remedy.
     """
     path = Path(path)
     meta = _read_meta(path / "meta.json", depth=(path / "depth.png").exists())
@@ -48,7 +51,8 @@ def read_frame_folder(path: Path | str) -> Frame:
             )
     depth = None if counts is None else (counts * np.float64(unit)).astype(np.float32)  # Frame turns 0 into NaN
     try:
-        camera = Camera(width, height, meta["camera_matrix_px"], meta["distortion"], meta["distortion_model"])
+        optics = [meta[key] for key in ("camera_matrix_px", "distortion", "distortion_model", *_DEVIATIONS)]
+        camera = Camera(width, height, *optics)
     except ValueError as error:
         raise ValueError(f"{path / 'meta.json'}: {error}") from None
     label = None if label is None else label.astype(np.int32)
@@ -58,7 +62,8 @@ def read_frame_folder(path: Path | str) -> Frame:
 def write_frame_folder(path: Path | str, frame: Frame) -> None:
     """Write a frame as the folder that `read_frame_folder` reads, over an earlier one.
 
-    All comes back as it was, but depth only to within half a count of 0.1 mm (1 mm beyond 6.5 m). meta.json goes first
+    All comes back as it was, but depth only to within half a count of 0.1 mm (1 mm where some is beyond 6.5 m), and
+    what is beyond 65.5 m as 65.5 m. meta.json goes first
     and comes last, so that a folder that was not finished is not read. Raises `ValueError` for ids that a label.png
     cannot hold.
     """
@@ -82,6 +87,10 @@ def write_frame_folder(path: Path | str, frame: Frame) -> None:
         "stamp_ns": int(frame.stamp_ns),
         "frame_id": frame.frame_id,
     }
+    deviations = (frame.camera.K_std, frame.camera.distortion_std, frame.camera.rms)
+    for key, value in zip(_DEVIATIONS, deviations, strict=True):
+        if value is not None:
+            meta[key] = np.asarray(value, np.float64).tolist()
     if unit is not None:
         meta["depth_unit_m"] = unit
     if frame.T_world_camera is not None:
@@ -152,12 +161,16 @@ def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
     if "depth_unit_m" in meta and not (number and 0 < unit <= 1):
         raise ValueError(f"{path}: depth_unit_m is {unit!r}; give metres per count, such as 0.001")
     optional = {"distortion": [0.0] * 5, "distortion_model": "plumb_bob", "stamp_ns": 0, "frame_id": "camera"}
-    meta = {**optional, "T_world_camera": None, **meta}
+    meta = {**optional, **dict.fromkeys(("T_world_camera", *_DEVIATIONS)), **meta}
     for key, default in optional.items():
         if isinstance(meta[key], bool) or not isinstance(meta[key], type(default)):
             raise ValueError(f"{path}: {key} is {meta[key]!r}; give something like {default!r}, or leave it out")
     meta["camera_matrix_px"] = _numbers(path, "camera_matrix_px", meta["camera_matrix_px"], (3, 3))
     meta["distortion"] = _numbers(path, "distortion", meta["distortion"], (len(meta["distortion"]),))
+    for key, shape in _DEVIATIONS.items():
+        if meta[key] is not None:
+            values = _numbers(path, key, meta[key], shape if shape != (-1,) else meta["distortion"].shape)
+            meta[key] = values if shape else float(values)
     if (T := meta["T_world_camera"]) is not None:
         meta["T_world_camera"] = _numbers(path, "T_world_camera", T, (4, 4))
         if not np.allclose(meta["T_world_camera"][3], [0, 0, 0, 1]):
@@ -173,5 +186,6 @@ def _numbers(path: Path, key: str, value: object, shape: tuple[int, ...]) -> Flo
     except (TypeError, ValueError):
         array = np.array(np.nan)
     if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"{path}: {key} {value!r} is not {' rows of '.join(map(str, shape))} finite numbers")
+        wanted = f"{' rows of '.join(map(str, shape))} finite numbers" if shape else "a finite number"
+        raise ValueError(f"{path}: {key} {value!r} is not {wanted}")
     return array

@@ -117,6 +117,9 @@ def test_eight_bit_depth_is_refused(folder: Path) -> None:
         ({"camera_matrix_px": K, "depth_unit_m": 0.001, "stamp_ns": "now"}, "stamp_ns is 'now'"),
         ({"camera_matrix_px": K, "depth_unit_m": 0.001, "frame_id": None}, "frame_id is None"),
         ({"camera_matrix_px": K, "depth_unit_m": 0.001, "T_world_camera": K}, "4 rows of 4 finite numbers"),
+        ({"camera_matrix_px": K, "depth_unit_m": 0.001, "camera_matrix_std_px": 2.0}, "3 rows of 3 finite numbers"),
+        ({"camera_matrix_px": K, "depth_unit_m": 0.001, "distortion_std": [0.1]}, "not 5 finite numbers"),
+        ({"camera_matrix_px": K, "depth_unit_m": 0.001, "rms_px": "good"}, "rms_px 'good' is not a finite number"),
         (
             {"camera_matrix_px": K, "depth_unit_m": 0.001, "T_world_camera": [[0, 0, 0, 1]] * 3 + [[1, 2, 3, 1]]},
             "transp",
