@@ -287,7 +287,10 @@ class Node:
         if self.show is not None and objects:
             from node.viewer.scene3d import CameraView
 
-            self.show(objects, CameraView(frame, segments))
+            try:
+                self.show(objects, CameraView(frame, segments))
+            except Exception as error:  # inference and the bus go on without the page
+                self._trouble(f"the page does not show this scene: {error or type(error).__name__}")
 
     def _record(self, h: Hypotheses, look: Look) -> None:
         if self.recorder is None:

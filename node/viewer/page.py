@@ -225,7 +225,10 @@ class Page:
         scene.add_camera_frustum("/camera/frustum", fov, aspect, scale=scale, thickness=0.002, image=small)
         scene.add_label("/camera/name", "camera", anchor="bottom-center")
         points, colours = scene3d.seen_surface(self._placed, view)
-        scene.add_point_cloud("/seen/points", points, colours, point_size=0.002, precision="float32")
+        if len(points):
+            scene.add_point_cloud("/seen/points", points, colours, point_size=0.002, precision="float32")
+        else:
+            scene.remove_by_name("/seen/points")
 
     def _draw_plane(self) -> None:
         assert self._placed is not None
@@ -290,10 +293,8 @@ class Page:
 
     def _rank_views(self, scene: list[Hypotheses], placed: Placed, shown: int) -> None:
         """Suggested next views, found in the background: it takes longer than to show the rest."""
-        try:
-            from perception.answers.next_view import rank_views
-        except ModuleNotFoundError:
-            return
+        from perception.answers.next_view import rank_views
+
         ranked = rank_views(scene, None, NEXT_VIEWS)
         with self._lock:
             if shown != self._shown:  # another scene is shown by now

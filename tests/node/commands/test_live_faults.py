@@ -17,6 +17,7 @@ import pytest
 from node.__main__ import main
 from node.commands.config_file import load_config
 from node.commands.live import LiveConfig, _Keeper
+from node.viewer.page import Page
 from perception.inference.tracker import Tracker, Update
 from perception.sources.frame import StillSource
 from perception.sources.open_source import SHIPPED_LOG
@@ -64,6 +65,25 @@ def test_a_page_that_cannot_open_leaves_no_recording(
         assert main([*run, "--record", str(tmp_path / "a.mcap"), "--page", str(port)]) == 1
     assert f"port {port} of 127.0.0.1 is in use" in capsys.readouterr().err
     assert not (tmp_path / "a.mcap").exists()
+
+
+def test_a_page_that_fails_ends_no_inference(
+    run: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    def fail(self: Page, scene: Any, view: Any) -> None:
+        raise RuntimeError("nothing to draw with")
+
+    def infer(self: Tracker, look: Any, *, on_answer: Any, **_: Any) -> Update:
+        h = replace(body_with_handle(), object_id=look.object_id)
+        for _ in range(3):
+            on_answer(h)
+        return Update("new", h, 1, 0.0, 0.0)
+
+    monkeypatch.setattr(Page, "show", fail)
+    monkeypatch.setattr(Tracker, "infer", infer)
+    assert main([*run, "--page", "0"]) == 0
+    said = capsys.readouterr()
+    assert said.err.count("nothing to draw with") == 1 and " 0 inferred" not in said.out
 
 
 @pytest.mark.parametrize("command", ["live", "replay"])

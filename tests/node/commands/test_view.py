@@ -154,6 +154,7 @@ def test_the_page_listens_on_this_machine_alone_and_shows_from_any_thread(frame:
         for thread in threads:
             thread.join()
         page.show([mug])
+        page.show([mug], camera_view(replace(frame, depth=None), [mug]))
         with pytest.raises(ValueError, match="no object to show"):
             page.show([])
     with socket.socket() as gone:
