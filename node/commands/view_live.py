@@ -2,6 +2,7 @@
 
 import threading
 from collections import OrderedDict
+from collections.abc import Iterable
 from typing import Any
 
 from rich.console import Console
@@ -10,7 +11,7 @@ from node.ros.bus import Bus
 from node.ros.bus_config import BusConfig
 from node.ros.messages import HYPOTHESES, hypotheses_from
 from node.ros.topic_source import TopicConfig, TopicSource
-from node.viewer.scene3d import camera_view
+from node.viewer.scene3d import CameraView, camera_view
 from perception.answers.hypotheses import Hypotheses
 from perception.sources.frame import Frame
 
@@ -36,8 +37,7 @@ def watch(endpoint: str, node: str, port: int, out: Console, err: Console) -> No
 
         def take(message: Any) -> None:
             scene = shown.take(hypotheses_from(message))
-            frame = shown.frame(scene[0].stamp_ns)
-            page.show(scene, None if frame is None else camera_view(frame, scene))
+            page.show(scene, shown.view())
             came.set()
 
         bus.subscribe(f"{node}/hypotheses", HYPOTHESES, take, depth=10)
@@ -65,16 +65,18 @@ class Shown:
         self._scene: dict[int, Hypotheses] = {}
         self._frames: OrderedDict[int, Frame] = OrderedDict()
 
-    def keep(self, source: TopicSource) -> None:
+    def keep(self, source: Iterable[Frame]) -> None:
         """Take frames until the source ends."""
         for frame in source:
             self._frames[frame.stamp_ns] = frame
             while len(self._frames) > FRAMES:
                 self._frames.popitem(last=False)
 
-    def frame(self, stamp_ns: int) -> Frame | None:
-        """The frame of this stamp, if it came."""
-        return self._frames.get(stamp_ns)
+    def view(self) -> CameraView | None:
+        """The scene's frame and the pixels of its objects, if the frame came."""
+        scene = list(self._scene.values())
+        frame = self._frames.get(scene[0].stamp_ns) if scene else None
+        return None if frame is None or frame.frame_id != scene[0].frame_id else camera_view(frame, scene)
 
     def take(self, h: Hypotheses) -> list[Hypotheses]:
         """The scene with one object's new hypotheses: all objects of that frame."""

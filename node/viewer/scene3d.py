@@ -13,6 +13,8 @@ from node.figures import voxel_renderer
 from perception.answers.hypotheses import FrameName, Hypotheses, binary_entropy, by_weight, mesh
 from perception.answers.query import QueryResult, query
 from perception.answers.regions import Box, Points
+from perception.inference.tracker import TrackConfig
+from perception.observation.rays import ObserveConfig, object_frame
 from perception.observation.segmentation import Segment, backproject, segment
 from perception.sources.frame import Frame
 from probnerf.rendering.occupancy import voxel_centres
@@ -27,12 +29,13 @@ BOX_EDGES = np.array(  # of the unit cube about the origin: [12 edges, 2 ends, 3
         for x, y in ((-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5))
     ]
 )
+REACH = TrackConfig().reach  # half extents between an object's cube and that of its segment
 LEAST_P = 0.02  # less probable voxels are not shown at all
 
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """The frame that a scene was inferred from, and what its pixels say of each object (by id)."""
+    """The frame that a scene was inferred from, and what its pixels say of each object found in it (by id)."""
 
     frame: Frame
     segments: Mapping[int, Segment]
@@ -65,6 +68,8 @@ class Placed:
 def camera_view(frame: Frame, scene: Sequence[Hypotheses]) -> CameraView:
     """A frame with the statuses of its pixels for the scene's objects, computed anew with the usual segmentation.
 
+    Segments belong to objects by the frame's label map. Without one they are numbered by size, which says nothing about
+    the objects' ids: there a segment belongs to the object at its place. An object without a segment has no statuses.
     Raises ValueError where the frame is not the scene's.
     """
     for h in scene:
@@ -73,8 +78,34 @@ def camera_view(frame: Frame, scene: Sequence[Hypotheses]) -> CameraView:
                 f"the frame beside it is '{frame.frame_id}' at {frame.stamp_ns} ns, but object {h.object_id} is of "
                 f"'{h.frame_id}' at {h.stamp_ns} ns"
             )
-    ids = {h.object_id for h in scene}
-    return CameraView(frame, {found.id: found for found in segment(frame) if found.id in ids})
+    try:
+        segments = segment(frame)
+    except ValueError:  # the node may have segmented it otherwise
+        return CameraView(frame, {})
+    if frame.label is not None:
+        ids = {h.object_id for h in scene}
+        return CameraView(frame, {found.id: found for found in segments if found.id in ids})
+    return CameraView(frame, _by_place(frame, segments, scene))
+
+
+def _by_place(frame: Frame, segments: Sequence[Segment], scene: Sequence[Hypotheses]) -> dict[int, Segment]:
+    """Each object's segment: of all pairs the nearest first, as far apart as a `Tracker` allows one object to be."""
+    pairs = []
+    for i, found in enumerate(segments):
+        try:
+            at = object_frame(frame, found, ObserveConfig()).T_camera_object[:3, 3]
+        except ValueError:  # not of a size that is inferred
+            continue
+        for h in scene:
+            cube = h.object_frame
+            apart = float(np.linalg.norm(cube.T_camera_object[:3, 3] - at)) / cube.half_extent
+            if apart < REACH:
+                pairs.append((apart, i, h.object_id))
+    chosen: dict[int, int] = {}
+    for _, i, name in sorted(pairs):
+        if name not in chosen and i not in chosen.values():
+            chosen[name] = i
+    return {name: replace(segments[i], id=name) for name, i in chosen.items()}
 
 
 def place(scene: Sequence[Hypotheses]) -> Placed:
@@ -177,7 +208,9 @@ def first_box(placed: Placed, unseen: Cloud) -> tuple[Float[np.ndarray, "3"], Fl
 
 
 def seen_surface(placed: Placed, view: CameraView) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """The points that the depth measured around the objects (m), with their colours."""
+    """The points that the depth measured around the objects (m), with their colours: none without depth."""
+    if view.frame.depth is None:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     points = backproject(view.frame)
     near = np.zeros(points.shape[:2], bool)
     for h in placed.objects:

@@ -6,6 +6,7 @@ import pytest
 
 from node.__main__ import main
 from node.commands.view_live import Shown, camera_topics
+from tests.node.mugs import table_frame
 from tests.node.shapes import body_with_handle
 
 
@@ -19,6 +20,21 @@ def test_a_scene_is_of_one_frame_and_an_object_in_it_is_the_newest() -> None:
     assert set(map(id, shown.take(better))) == {id(better), id(second)}
     later = replace(second, stamp_ns=second.stamp_ns + 1)
     assert shown.take(later) == [later]
+
+
+def test_the_view_is_the_frame_of_the_scene() -> None:
+    table = replace(table_frame(), label=None, depth=None, T_world_camera=None)
+    h = replace(body_with_handle(), stamp_ns=table.stamp_ns, frame_id=table.frame_id)
+    shown = Shown()
+    assert shown.view() is None
+    shown.take(h)
+    shown.keep([replace(table, stamp_ns=table.stamp_ns + 1)])
+    assert shown.view() is None
+    shown.keep([replace(table, frame_id="another")])
+    assert shown.view() is None
+    shown.keep([table])
+    view = shown.view()
+    assert view is not None and view.frame is table and view.segments == {}  # by itself nothing is found in it
 
 
 def test_a_node_tells_its_camera_under_its_own_name() -> None:

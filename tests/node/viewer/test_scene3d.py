@@ -148,6 +148,30 @@ def test_the_picture_is_tinted_by_status(frame: Frame, scene: list[Hypotheses]) 
         scene3d.camera_view(frame, [replace(scene[0], frame_id="other")])
 
 
+@pytest.mark.parametrize("ids", [(1, 2), (2, 1), (7, 9)])
+def test_pixels_belong_to_the_object_at_their_place(
+    frame: Frame, scene: list[Hypotheses], ids: tuple[int, int]
+) -> None:
+    """Without a label map segments are numbered by size, and objects by whoever tracks them."""
+    labels, unlabelled = frame.label, replace(frame, label=None)
+    named = [replace(h, object_id=name) for h, name in zip(scene, ids, strict=True)]
+    for shown in (named, named[::-1], named[1:]):
+        segments = scene3d.camera_view(unlabelled, shown).segments
+        assert segments.keys() == {h.object_id for h in shown}
+        for label, h in zip((1, 2), named, strict=True):
+            if h.object_id in segments:
+                found = segments[h.object_id]
+                assert found.id == h.object_id and (labels[found.mask] == label).mean() > 0.95
+    away = replace(scene[0].object_frame, T_camera_object=scene[0].object_frame.T_camera_object + 0.3 * np.eye(4, k=3))
+    assert scene3d.camera_view(unlabelled, [replace(scene[0], object_frame=away)]).segments == {}
+
+
+def test_a_frame_without_depth_has_no_seen_points(frame: Frame, mug: Hypotheses) -> None:
+    view = scene3d.camera_view(replace(frame, depth=None), [mug])
+    points, colours = scene3d.seen_surface(scene3d.place([mug]), view)
+    assert points.shape == colours.shape == (0, 3) and colours.dtype == np.uint8
+
+
 def test_words_are_plain(mug: Hypotheses) -> None:
     now = mug.stamp_ns + 90 * 10**9
     said = panel.state([mug], now)
