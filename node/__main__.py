@@ -3,7 +3,6 @@
 A command's code is imported when it runs, so that help and mistyped options answer at once.
 """
 
-import inspect
 import os
 import signal
 import sys
@@ -11,11 +10,10 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeVar, get_type_hints
+from typing import Any, NoReturn, TypeVar
 
 import tyro
 from rich.console import Console
-from tyro.conf import arg
 
 from node.options import Calibrate, Capture, Live, Query, Record, Replay, View
 
@@ -24,7 +22,7 @@ Options = TypeVar("Options")
 DESCRIPTION = """Farside: from one partial RGB-D view of an object, several whole, weighted shapes, and the probability
 that any space the camera cannot see is occupied. Lengths are in metres. With --debug an error shows its traceback."""
 
-BENCH = "Run a measurement: print its table, draw its picture, and write its figures as JSON."
+BENCH = "Run a study: print its table, draw its picture, and write its rows as JSON. Needs a checkout."
 TRAIN = "Train a prior on procedural tabletop objects, or on pictures of your own; resumes by itself after a stop."
 SUMMARIES = {
     "replay": str(Replay.__doc__),
@@ -165,45 +163,9 @@ def _train(args: Sequence[str]) -> int:
 
 
 def _bench(args: Sequence[str]) -> int:
-    from node.commands.bench import load_benchmark, names, run
+    from node.commands.bench import bench
 
-    found = names()
-    if not args or args[0] not in found:
-        tyro.extras.subcommand_cli_from_dict(
-            {name: _documented(name, text) for name, text in found.items()},
-            prog="farside bench",
-            description=BENCH,
-            args=args,
-            sort_subcommands=False,
-        )
-        return 0
-    main = load_benchmark(args[0])
-    options = tyro.cli(_with_json(main), args=args[1:], prog=f"farside bench {args[0]}")
-    run(args[0], main, options, Console(), Console(stderr=True))
-    return 0
-
-
-def _with_json(main: Callable) -> Callable[..., dict]:
-    """A function of a measurement's options and of `json` that gives them back as a dict."""
-
-    def collect(**options: object) -> dict:
-        return options
-
-    hints = get_type_hints(main)
-    hints["out"] = Annotated[Path, arg(metavar="DIR", help="Folder for the picture.")]
-    hints["quick"] = Annotated[bool, tyro.conf.FlagCreatePairsOff, arg(help="Only a few objects, in a minute.")]
-    parameters = []
-    for p in inspect.signature(main).parameters.values():
-        default = Path("out/bench") if p.name == "out" else p.default
-        parameters.append(p.replace(kind=p.KEYWORD_ONLY, default=default, annotation=hints[p.name]))
-    json = Annotated[
-        Path | None, arg(metavar="FILE", help="Write the rows as JSON.", help_behavior_hint="(default: no)")
-    ]
-    parameters.append(inspect.Parameter("json", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=json))
-    collect.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    collect.__annotations__ = {p.name: p.annotation for p in parameters}
-    collect.__doc__ = main.__doc__
-    return collect
+    return bench(args)
 
 
 def _documented(name: str, text: str) -> Callable[[], None]:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.mesh import Cloud, picture_of
-from benchmarks.scene import ViewConfig, simulated_camera
+from benchmarks.scenes.meshes import Cloud, picture_of
+from benchmarks.scenes.vessels import ViewConfig, simulated_camera
 from perception.answers.query import query
 from perception.answers.regions import Box
 from perception.inference.controller import ControllerConfig, Estimate, estimate

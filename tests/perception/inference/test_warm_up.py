@@ -10,9 +10,9 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks.occluded import carton_seeds, half_hidden
-from benchmarks.scene import vessel_view
-from benchmarks.unseen import any_view
+from benchmarks.scenes.cartons import carton_seeds, half_hidden
+from benchmarks.scenes.conditions import any_view
+from benchmarks.scenes.vessels import vessel_view
 from perception.inference.controller import ControllerConfig
 from perception.inference.tracker import Tracker, Update
 from perception.inference.warm_up import _alone, warm_up

@@ -1,0 +1,111 @@
+"""Views of objects as they come, or picked for what they hide, by condition: the first test seeds of each.
+
+- any view: the next objects of the family as they come, any kind, from a random camera. Nothing is selected by what the
+  view hides, so a right posterior is calibrated here.
+- any view, colour only: the same without depth; the plane is the one that the camera's pose gives.
+- any view, pose known: the same, in the object's own cube, as a marker on it would tell it.
+- half hidden: as any view, with a carton before them that hides 35 to 65% of their pixels.
+- no handle in sight: as any view, cups, mugs and pitchers of which no pixel shows a handle; whether one is behind, the
+  view leaves open, and nothing was picked by it.
+- handle hidden: vessels whose handle no pixel shows. They are selected by a truth that the view leaves open (every one
+  has a handle): even a right posterior errs here, towards no handle.
+"""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import count
+
+import numpy as np
+from jaxtyping import Float
+
+from benchmarks.scenes.cartons import carton_seeds, half_hidden
+from benchmarks.scenes.vessels import (
+    VesselPicture,
+    VesselView,
+    ViewConfig,
+    pixels_of_handle,
+    place,
+    shows_handle,
+    simulated_camera,
+    vessel_picture,
+    vessel_view,
+)
+from perception.simulation.simulated_camera import Placed, Scene, render
+from probnerf.objects.tabletop import TEST_SEEDS
+from probnerf.objects.tabletop_sampler import CUP, MUG, PITCHER
+
+ANY, COLOUR, KNOWN = "any view", "any view, colour only", "any view, pose known"
+HALF, BEHIND, HANDLE = "half hidden", "no handle in sight", "handle hidden"
+
+
+def any_view(seed: int) -> VesselPicture:
+    """The object of a family seed from a random camera."""
+    placed, T = _stand(seed)
+    camera = simulated_camera(ViewConfig())
+    return VesselPicture(placed, camera, T, render(Scene((placed,)), camera, T))
+
+
+def _stand(seed: int) -> tuple[Placed, Float[np.ndarray, "4 4"]]:
+    return place(seed, np.random.default_rng([seed, 47]), ViewConfig())
+
+
+def _half(seed: int) -> VesselPicture | None:
+    return half_hidden(seed, next(carton_seeds(range(seed + 1, seed + 1000))))
+
+
+def _no_handle_in_sight(seed: int) -> VesselPicture | None:
+    placed, T = _stand(seed)
+    if placed.shape.kind not in (CUP, MUG, PITCHER) or shows_handle(placed, T):  # a small picture costs less
+        return None
+    picture = any_view(seed)
+    return None if pixels_of_handle(picture) else picture
+
+
+PICTURES_BEGIN = 6000  # of `faultless_pictures` among the test seeds
+
+# of each condition: where among the test seeds it begins, and its picture; only those of one begin share objects
+SORTS: dict[str, tuple[int, Callable[[int], VesselPicture | None]]] = {
+    ANY: (0, any_view),
+    COLOUR: (0, any_view),
+    KNOWN: (0, any_view),
+    HALF: (2000, _half),
+    BEHIND: (6000, _no_handle_in_sight),
+    HANDLE: (4000, partial(vessel_picture, handle="hidden")),
+}
+
+
+def views(condition: str, n: int, known: Callable[[int], bool]) -> Iterator[tuple[int, VesselView | None]]:
+    """(seed, view) of the first `n` objects; None where `known` says that it is not needed."""
+    begin, picture_of = SORTS[condition]
+    found = 0
+    for number in count(begin):
+        if found == n or number >= len(TEST_SEEDS):
+            return
+        seed = TEST_SEEDS[number]
+        if known(seed):
+            found += 1
+            yield seed, None
+            continue
+        picture = picture_of(seed)
+        try:
+            view = None if picture is None else vessel_view(picture, condition != COLOUR, pose_known=condition == KNOWN)
+        except ValueError:  # outside perception's range of sizes, or too few pixels
+            continue
+        if view is not None:
+            found += 1
+            yield seed, view
+
+
+def faultless_pictures(n: int) -> list[VesselPicture]:
+    """The first `n` views that perception does not refuse without any fault."""
+    found: list[VesselPicture] = []
+    for number in TEST_SEEDS[PICTURES_BEGIN:]:
+        if len(found) == n:
+            break
+        picture = any_view(number)
+        try:
+            vessel_view(picture)
+            found.append(picture)
+        except ValueError:
+            continue
+    return found

@@ -1,0 +1,200 @@
+"""Where samplers get stuck, and how wide their answers are: chains side by side, and draws of what nobody saw.
+
+The views of `farside bench stability`. Per method:
+
+- unexplained: share of the view's telling pixels that a chain (or population) leaves unexplained, mean of its samples;
+  its mean, its standard deviation over the chains of a view and the worst chain's, means over views. A chain that is
+  stuck in a wrong mode stands out. Annealed HMC begins hot and cools; at a fixed temperature the same number of steps
+  is spent at the likelihood's own scale (the paper's figure of multimodality).
+- volume_sd: standard deviation over the answer's draws of the volume that is solid where nobody saw, over its mean.
+  Variational inference fits one Gaussian, which falls into one mode: its draws agree where others' do not.
+- rounding (of tempered_smc alone): how far the kernel's float32 log-likelihood is from plain JAX in float64 at the
+  samples: the largest error of a difference between two samples, nats; these differences are what samplers see.
+
+Answers are appended to a file as they come, and what is there is not made again.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from benchmarks.harness.intervals import interval, mean_rows, paired_interval
+from benchmarks.harness.progress import say, table
+from benchmarks.harness.results import FOLDER, Line, append_line, key, newest, read_lines, refuse_cut
+from benchmarks.harness.rows import Row
+from benchmarks.rivals.methods import (
+    METHODS,
+    VI,
+    Method,
+    Question,
+    Sampled,
+    annealed,
+    answer,
+    paper_schedule,
+    settings_of,
+)
+from benchmarks.scenes.conditions import faultless_pictures
+from benchmarks.scenes.vessels import GRID, vessel_view
+from perception.inference.controller import ControllerConfig
+from probnerf.inference import without_sizes
+from probnerf.likelihood.dispatch import log_likelihood, plain_log_likelihood
+from probnerf.prior.checkpoint import Prior, load_prior
+from probnerf.shapes import explained
+
+RESULTS = FOLDER / "chains.jsonl"
+CONDITION = "any view"
+ROUNDED = 32  # samples whose log-likelihood is evaluated in float64, too
+
+
+def _named(name: str) -> Method:
+    return next(m for m in METHODS if m.name == name)
+
+
+SMC = _named("smc")
+ANNEALED = paper_schedule(annealed(20, 100))
+FIXED = _named("fixed 20x100")
+COMPARED = (SMC, ANNEALED, FIXED, VI)
+
+
+def unexplained(question: Question, sampled: Sampled) -> Float[np.ndarray, "chains"]:
+    """Share of telling pixels that each chain leaves unexplained, by its samples' weights."""
+    posterior = sampled.posterior
+    share = explained(question.prior.model, without_sizes(sampled.likelihood), sampled.observation, posterior.positions)
+    missed, weights = 1.0 - np.asarray(share, np.float64), np.exp(np.asarray(posterior.log_weights, np.float64))
+    chain = np.asarray(posterior.population)
+    found = []
+    for c in np.unique(chain):
+        own = weights[chain == c]
+        found.append(np.average(missed[chain == c], weights=own if own.sum() > 0.0 else None))  # a failed one has none
+    return np.array(found)
+
+
+def relative_spread(volumes: Float[np.ndarray, "s"], weights: Float[np.ndarray, "s"]) -> float:
+    """Standard deviation over mean; 0 where there is nothing."""
+    mean = float(weights @ volumes / weights.sum())
+    variance = float(weights @ (volumes - mean) ** 2 / weights.sum())
+    return float(np.sqrt(variance)) / mean if mean > 0 else 0.0
+
+
+def rounding(question: Question, sampled: Sampled) -> float:
+    """The largest error of a difference of two samples' log-likelihoods, nats."""
+    single = question.arguments
+    positions = sampled.posterior.positions[:ROUNDED]
+    found = np.asarray(jax.jit(log_likelihood)(single, positions), np.float64)
+    with jax.enable_x64(True):
+        double, exact = jax.tree.map(
+            lambda a: jnp.asarray(a, jnp.float64) if a.dtype == jnp.float32 else a, (single, positions)
+        )
+        expected = np.asarray(jax.jit(plain_log_likelihood)(double, exact))
+    return float(np.ptp(found - expected))
+
+
+def main(
+    out: Path,
+    quick: bool = False,
+    prior: Path | None = None,
+    n: int = 8,
+    seed: int = 0,
+    results: Path = RESULTS,
+    only_chart: bool = False,
+) -> list[Row]:
+    """Chains that get stuck, draws that collapse, and what float32 costs.
+
+    Args:
+        prior: weights to use; the shipped ones by default
+        n: views
+        seed: of the samplers
+        results: file that answers are appended to, and read from
+        only_chart: draw what the file holds
+    """
+    compared: Sequence[Method] = COMPARED
+    if quick:
+        compared, n, results = (SMC,), 1, out / "chains.jsonl" if results == RESULTS else results
+    loaded = load_prior(prior)
+    if not only_chart:
+        _measure(loaded, compared, n, seed, results)
+    lines = newest(read_lines(results), loaded.hash, seed)
+    by = {m.name: [line for line in lines if line["method"] == m.name][:n] for m in compared}
+    if not all(by.values()):
+        raise ValueError(f"{results} has no answers of {', '.join(m for m in by if not by[m])}; leave --only-chart")
+    _draw(by, out / "chains.png")
+    return _rows(by)
+
+
+def _measure(prior: Prior, compared: Sequence[Method], n: int, seed: int, results: Path) -> None:
+    config = ControllerConfig()
+    done = {key(line) for line in read_lines(results)}
+    for number, picture in enumerate(faultless_pictures(n), start=1):
+        view = vessel_view(picture)
+        common = {"prior": prior.hash, "condition": CONDITION, "object": view.seed, "seed": seed}
+        for method in compared:
+            line: Line = {**common, "method": method.name, "settings": settings_of(method, config)}
+            if key(line) in done:
+                continue
+            question = Question(view, prior, config, seed)
+            found, sampled, _ = answer(method, question)
+            refuse_cut(found.result)
+            volumes = (found.shapes & ~view.seen).reshape(-1, GRID**3).sum(axis=1).astype(np.float64)
+            line["unexplained"] = [round(u, 4) for u in unexplained(question, sampled)]
+            line["volume_sd"] = round(relative_spread(volumes, found.weights), 4)
+            if method is SMC:
+                line["rounding"] = float(f"{rounding(question, sampled):.3g}")
+            append_line(results, line)
+            said = line["unexplained"]
+            say(
+                f"view {number} of {n}: {method.name}: unexplained {min(said):.3f} to {max(said):.3f}, hidden volume"
+                f" +- {100 * line['volume_sd']:.0f}%"
+            )
+
+
+def _rows(by: dict[str, list[Line]]) -> list[Row]:
+    rows, lines = [], []
+    reference = {line["object"]: line["volume_sd"] for line in by[SMC.name]}
+    for name, found in by.items():
+        chains = [np.array(line["unexplained"]) for line in found]
+        values = {
+            "unexplained": [c.mean() for c in chains],
+            "unexplained_sd": [c.std() for c in chains],
+            "unexplained_worst": [c.max() for c in chains],
+            "volume_sd": [line["volume_sd"] for line in found],
+        }
+        if name == SMC.name:
+            values["rounding"] = [line["rounding"] for line in found]
+        for metric, each in values.items():
+            rows += mean_rows("chains", name, CONDITION, metric, each, "nats" * (metric == "rounding"))
+        common = [line for line in found if line["object"] in reference]
+        gap = paired_interval(
+            np.array([line["volume_sd"] for line in common]), np.array([reference[line["object"]] for line in common])
+        )
+        rows.append(Row("chains", name, CONDITION, "volume_sd_above_smc", gap.mean, "", gap.n))
+        shown = (f"{interval(values[m]).mean:.3f}" for m in values if m != "rounding")
+        lines.append([name, str(len(found)), *shown, f"{gap.mean:+.3f} ({gap.low:+.3f} to {gap.high:+.3f})"])
+    header = ("method", "views", "unexplained", "sd of chains", "worst chain", "volume_sd", "above smc's (95%)")
+    table("Chains and draws, means over views", header, lines)
+    worst = max(line["rounding"] for line in by[SMC.name])
+    say(f"\nfloat32 against float64: differences of log-likelihoods err by at most {worst:.2g} nats")
+    return rows
+
+
+def _draw(by: dict[str, list[Line]], path: Path) -> None:
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    stuck, wide = figure.subplots(1, 2)
+    colours = ("tab:blue", "tab:orange", "tab:red", "tab:green")
+    for at, ((name, found), colour) in enumerate(zip(by.items(), colours, strict=False)):
+        for view, line in enumerate(found):
+            values = np.array(line["unexplained"])
+            x = np.full(len(values), view + 0.18 * (at - 1.5))
+            stuck.plot(x, values, ".", color=colour, ms=5, label=name if view == 0 else None)
+        wide.plot(range(len(found)), [line["volume_sd"] for line in found], "o-", color=colour, label=name)
+    stuck.set(title="chains of one view, side by side", xlabel="view", ylabel="pixels left unexplained, share")
+    stuck.set_yscale("symlog", linthresh=0.02)
+    wide.set(title="volume where nobody saw: spread of the draws", xlabel="view", ylabel="standard deviation / mean")
+    for ax in (stuck, wide):
+        ax.legend(fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)

@@ -1,0 +1,192 @@
+"""No more model than a scene needs: what the controller spends on easy scenes and on hard ones.
+
+Easy: a plain can without a handle, nothing before it, seen from 30 to 50 degrees above. Hard: a printed pitcher of
+which a carton hides 35 to 65% of the pixels. Test seeds, RGB-D, the whole path from frame to hypotheses, at one
+tolerance; beside it the largest model for every scene. Cost is field evaluations with gradient, and seconds from the
+frame to the last answer (compiled before); first_answer is the first one that can be published. hidden_nll is that of
+`farside bench hidden`.
+"""
+
+import resource
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.harness.intervals import interval, mean_rows, paired_interval
+from benchmarks.harness.progress import say, table
+from benchmarks.harness.rows import Row
+from benchmarks.measures.metrics import scored_voxels
+from benchmarks.measures.scores import Answer, random_boxes, score
+from benchmarks.scenes.cartons import carton_seeds, half_hidden
+from benchmarks.scenes.vessels import (
+    GRID,
+    VesselPicture,
+    VesselView,
+    ViewConfig,
+    base_rate,
+    place,
+    simulated_camera,
+    vessel_view,
+)
+from perception.inference.controller import ControllerConfig, Estimate, estimate
+from perception.simulation.simulated_camera import Placed, Scene, render
+from probnerf.objects.tabletop import KINDS, TEST_SEEDS, TEXTURES
+from probnerf.prior.checkpoint import load_prior
+from probnerf.rendering.occupancy import coarsen
+
+EASY, HARD = CONDITIONS = ("plain can, seen well", "printed pitcher, half hidden")
+CONTROLLER, LARGEST = METHODS = ("controller", "largest model")
+METRICS = {"point_gradients": "", "first_answer": "s", "seconds": "s", "hidden_nll": "nats"}
+PARTS = ("climbing", "sampling", "publishing")  # of the seconds; the rest is to observe
+
+
+@dataclass(frozen=True, eq=False)
+class Spent:
+    """One scene's figures, by method and metric."""
+
+    values: dict[str, dict[str, float]]
+    log: tuple[str, ...]  # the controller's
+
+
+def scenes(condition: str, count: int) -> Iterator[VesselView]:
+    """The first `count` views of test seeds that fit a condition."""
+    kind, texture = ("can", "plain") if condition == EASY else ("pitcher", "printed")
+    cartons = carton_seeds(TEST_SEEDS)
+    found = 0
+    for seed in TEST_SEEDS:
+        shape = Placed(seed, 0.0, 0.0, 0.0).shape
+        if found == count:
+            return
+        if KINDS[int(shape.kind)] != kind or TEXTURES[int(shape.texture)] != texture:
+            continue
+        if condition == EASY and bool(shape.has_handle):
+            continue
+        picture = _easy(seed) if condition == EASY else half_hidden(seed, next(cartons))
+        try:
+            if picture is not None:
+                yield vessel_view(picture)
+                found += 1
+        except ValueError:  # outside perception's range of sizes
+            continue
+
+
+def _easy(seed: int) -> VesselPicture:
+    config = ViewConfig(elevation=(30.0, 50.0))
+    placed, T = place(seed, np.random.default_rng([seed, 41]), config)
+    camera = simulated_camera(config)
+    return VesselPicture(placed, camera, T, render(Scene((placed,)), camera, T))
+
+
+def main(out: Path, quick: bool = False, prior: Path | None = None, n: int = 8, seed: int = 0) -> list[Row]:
+    """What the controller spends on easy and on hard scenes, beside the largest model for all.
+
+    Args:
+        prior: weights to use; the shipped ones by default
+        n: scenes of each sort
+        seed: of the samplers
+    """
+    n = min(n, 2) if quick else n
+    loaded, config = load_prior(prior), ControllerConfig()
+    amounts = {CONTROLLER: config, LARGEST: replace(config, tolerance=0.0)}
+    rate = base_rate(128 if quick else 1024, config=config.observe)
+    spent: dict[str, list[Spent]] = {condition: [] for condition in CONDITIONS}
+    warm = set[str]()
+
+    def measured(view: VesselView, amount: ControllerConfig) -> tuple[dict[str, float], Estimate]:
+        """One scene's figures with one amount of model, by metric, and what they are of."""
+        begun, told = time.monotonic(), list[float]()
+        found = estimate(
+            view.frame,
+            view.segment,
+            loaded,
+            amount,
+            seed=seed,
+            on_answer=lambda _: told.append(time.monotonic() - begun),
+        )
+        h = found.hypotheses
+        rng = np.random.default_rng([seed, view.seed, 31])
+        boxes = random_boxes(scored_voxels(view.seen, rate), 1, rng)
+        judged = score(view, Answer(coarsen(h.solid, GRID), h.weights, found.seconds), rate, boxes, rng)
+        cost = {"point_gradients": h.diagnostics["point_gradients"], "first_answer": told[0], "seconds": told[-1]}
+        parts = {part: found.parts.get(part, 0.0) for part in PARTS}
+        return {**cost, **parts, "hidden_nll": judged.values["hidden_nll"]}, found
+
+    for condition in CONDITIONS:
+        for view in scenes(condition, n):
+            if condition not in warm:  # each begins elsewhere, with programs of its own
+                measured(view, replace(config, runs=1))
+                warm.add(condition)
+            got = {method: measured(view, amount) for method, amount in amounts.items()}
+            values = {method: values for method, (values, _) in got.items()}
+            spent[condition].append(Spent(values, got[CONTROLLER][1].log))
+            c, largest = values[CONTROLLER], values[LARGEST]
+            say(
+                f"{condition}, {view.seed}: {c['point_gradients'] / 1e6:.1f} of {largest['point_gradients'] / 1e6:.1f}"
+                f" million, {c['seconds']:.1f} of {largest['seconds']:.1f} s, {c['hidden_nll']:.3f} against"
+                f" {largest['hidden_nll']:.3f} nats"
+            )
+            for line in spent[condition][-1].log:
+                say(f"    {line}")
+    rows = _rows(spent)
+    peak = 1e-6 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # kB
+    rows.append(Row("effort", "both", "the process", "peak_memory", peak, "GB", 1))
+    _draw(spent, out / "effort.png")
+    return rows
+
+
+def _rows(spent: dict[str, list[Spent]]) -> list[Row]:
+    rows, lines, none = [], [], [""] * len(PARTS)
+
+    def column(condition: str, method: str, metric: str) -> list[float]:
+        return [s.values[method][metric] for s in spent[condition]]
+
+    for condition in CONDITIONS:
+        for method in METHODS:
+            for metric, unit in (METRICS | dict.fromkeys(PARTS, "s")).items():
+                rows += mean_rows("effort", method, condition, metric, column(condition, method, metric), unit)
+            cells = [f"{interval(column(condition, method, metric)).mean:.3g}" for metric in (*METRICS, *PARTS)]
+            lines.append([condition, method, *cells])
+        gap = paired_interval(
+            *(np.array(column(condition, method, "hidden_nll")) for method in (CONTROLLER, LARGEST)),
+        )
+        for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
+            rows.append(Row("effort", CONTROLLER, condition, f"nll_above_largest{label}", value, "nats", gap.n))
+        lines.append(
+            [
+                condition,
+                "controller's nll above the largest's, 95%",
+                *[""] * 3,
+                f"{gap.low:+.3f} .. {gap.high:+.3f}",
+                *none,
+            ]
+        )
+    for metric in ("point_gradients", "seconds"):
+        easy, hard = (float(np.mean(column(condition, CONTROLLER, metric))) for condition in CONDITIONS)
+        rows.append(Row("effort", CONTROLLER, "easy over hard", metric, easy / hard, "", len(spent[EASY])))
+        lines.append(["easy over hard (aim: 0.2)", metric, f"{easy / hard:.3f}", "", "", "", *none])
+    table("What scenes cost", ("condition", "method", *METRICS, *PARTS), lines)
+    return rows
+
+
+def _draw(spent: dict[str, list[Spent]], path: Path) -> None:
+    """Every scene's cost and score, an arrow from the controller to the largest model."""
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    ax = figure.subplots()
+    for condition, colour in zip(CONDITIONS, ("tab:green", "tab:red"), strict=True):
+        for i, s in enumerate(spent[condition]):
+            points = [(s.values[m]["point_gradients"], s.values[m]["hidden_nll"]) for m in METHODS]
+            ax.plot(*np.array(points).T, color=colour, linewidth=0.7, alpha=0.5)
+            for (x, y), marker, method in zip(points, ("o", "s"), METHODS, strict=True):
+                label = f"{condition}: {method}" if i == 0 else None
+                ax.plot(
+                    x, y, marker=marker, color=colour, fillstyle="full" if marker == "o" else "none", label=label, ls=""
+                )
+    ax.set(xscale="log", xlabel="field evaluations with gradient", ylabel="hidden_nll, nats (lower is better)")
+    ax.set_title("A line joins one scene's two answers")
+    ax.legend(fontsize=9)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)

@@ -1,0 +1,235 @@
+"""Is a handle behind it? How likely the answer's shapes say so, against how often one is.
+
+Cups, mugs and pitchers of which no pixel shows a handle, not picked by whether one is there ("no handle in sight" of
+`scenes.conditions`): test seeds, RGB-D, the whole path. Each shape of an answer is decoded in the canonical frame, its
+handle at +x, and has one if it reaches farther past its body there than any of the family does without (`reach`). p is
+the share of the answer's weight on shapes that do.
+
+Measures: said and true, the mean p and the share of objects with a handle, of all and by p; log_score and brier of p;
+hidden_nll as `farside bench hidden`. "the prior alone" says of each object how many of the prior's shapes have a
+handle. "from the prior" is the controller that does not begin at modes. Results are appended to a file, object by
+object, and what is there is not made again.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from itertools import pairwise
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from matplotlib.figure import Figure
+
+from benchmarks.harness.intervals import interval, mean_rows, paired_interval
+from benchmarks.harness.progress import say, table
+from benchmarks.harness.results import FOLDER, Line, append_line, digest, key, newest, read_lines
+from benchmarks.harness.rows import Row
+from benchmarks.measures.metrics import scored_voxels
+from benchmarks.measures.scores import BOXES, random_boxes, score
+from benchmarks.rivals.methods import CONTROLLER, FROM_PRIOR, METHODS, Question, answer, settings_of
+from benchmarks.scenes.conditions import BEHIND, views
+from benchmarks.scenes.vessels import GRID, base_rate
+from perception.inference.controller import ControllerConfig
+from perception.simulation.simulated_camera import Placed
+from probnerf.fields.base import Model
+from probnerf.inference import likelihood_settings
+from probnerf.prior.checkpoint import load_prior
+from probnerf.rendering.occupancy import solid
+from probnerf.shapes import opacity_grids
+
+RESULTS = FOLDER / "handle.jsonl"
+OWN = CONTROLLER.name
+PRIOR = "the prior alone"
+ASKED = (CONTROLLER, FROM_PRIOR, next(m for m in METHODS if m.name == "encoder alone"))
+COLOURS = dict(zip((m.name for m in ASKED), ("tab:blue", "tab:purple", "tab:orange"), strict=True))
+REACH = 2.25  # voxels: the family's shapes reach at most 0 without a handle and at least 4 with one
+EDGES = (0.0, 0.05, 0.3, 0.6, 1.0)  # of p
+PRIOR_SHAPES = 1000
+UNITS = {"said": "", "true": "", "log_score": "nats", "brier": "", "hidden_nll": "nats", "point_gradients": ""}
+COMPARED = ("log_score", "hidden_nll")  # with the controller's
+COLUMNS = ("said", "true", "log_score", "brier", "hidden_nll", *(f"{metric} above" for metric in COMPARED))
+
+
+def reach(shapes: Bool[np.ndarray, "s x y z"]) -> Float[np.ndarray, "s"]:
+    """How far each shape reaches past its body towards +x, voxels; 0 or less where nothing sticks out.
+
+    Slice by slice: the body is as wide along x as along y, and begins where the slice does on the side of -x.
+    """
+    return np.array([_reach(shape) for shape in shapes])
+
+
+def _reach(shape: Bool[np.ndarray, "x y z"]) -> float:
+    along, across = np.any(shape, axis=1).T, np.any(shape, axis=0).T  # [z, x], [z, y]
+    slices = []
+    for row, column in zip(along, across, strict=True):
+        if row.sum() > 2 and column.sum() > 2:
+            (x,), (y,) = np.nonzero(row), np.nonzero(column)
+            radius = (y[-1] - y[0] + 1) / 2
+            slices.append((x[0] + radius, radius, x[-1] + 1))
+    if not slices:
+        return 0.0
+    axis, radius, end = np.array(slices).T
+    return float(np.max(end - np.median(axis) - radius))
+
+
+def has_handle(model: Model, positions: Float[Array, "s d"]) -> Bool[np.ndarray, "s"]:
+    """Whether the shape at each position has one, wherever it is turned to."""
+    unturned = likelihood_settings(ControllerConfig().infer, sample_pose=False)
+    grids = opacity_grids(
+        model, unturned, positions[:, : model.latent], jnp.zeros(5), jnp.ones((GRID, GRID, GRID), bool)
+    )
+    return reach(solid(np.asarray(grids))) > REACH
+
+
+def log_score(
+    p: Float[np.ndarray, "n"], true: Bool[np.ndarray, "n"], shapes: int | Int[np.ndarray, "n"]
+) -> Float[np.ndarray, "n"]:
+    """-log of what was said of what is true, nats; p as if half a shape more had spoken for either side."""
+    p = (p * shapes + 0.5) / (shapes + 1)
+    return -np.log(np.where(true, p, 1.0 - p))
+
+
+def main(
+    out: Path,
+    quick: bool = False,
+    prior: Path | None = None,
+    n: int = 86,
+    slow: int = 40,
+    methods: str = "",
+    seed: int = 0,
+    results: Path = RESULTS,
+    only_chart: bool = False,
+) -> list[Row]:
+    """How likely the answer says that a handle is behind, against how often one is.
+
+    Args:
+        prior: weights to use; the shipped ones by default
+        n: objects
+        slow: of them, those that the controller from the prior answers, too
+        methods: only these, separated by semicolons
+        seed: of the samplers
+        results: file that results are appended to, and read from
+        only_chart: draw what the file holds
+    """
+    if quick:
+        n, slow, results = 1, 0, out / "handle.jsonl" if results == RESULTS else results
+    names = [m.strip() for m in methods.split(";") if m.strip()] or [m.name for m in ASKED]
+    if unknown := set(names) - {m.name for m in ASKED}:
+        raise ValueError(f"no method {sorted(unknown)}; there are: {'; '.join(m.name for m in ASKED)}")
+    loaded, config = load_prior(prior), ControllerConfig()
+    if not only_chart:
+        done = {key(line) for line in read_lines(results)}
+        rate = base_rate(128 if quick else 1024, config=config.observe)
+        for method in (m for m in ASKED if m.name in names):
+            told = {"digest": digest([settings_of(method, config), asdict(config)], quick)}
+            own = {"prior": loaded.hash, "method": method.name, "settings": told, "condition": BEHIND, "seed": seed}
+            count = min(n, slow) if method is FROM_PRIOR else n
+
+            def known(number: int, own: Line = own) -> bool:
+                return key({**own, "object": number}) in done
+
+            for number, view in views(BEHIND, count, known):
+                if view is None:
+                    continue
+                found, sampled, positions = answer(method, Question(view, loaded, config, seed))
+                p = float(found.weights @ has_handle(loaded.model, positions))
+                rng = np.random.default_rng([seed, view.seed, 31])
+                boxes = random_boxes(scored_voxels(view.seen, rate), BOXES, rng)
+                line = {
+                    **own,
+                    "object": number,
+                    "p": round(p, 5),
+                    "shapes": len(found.weights),
+                    "handle": bool(Placed(number, 0.0, 0.0, 0.0).shape.has_handle),
+                    "hidden_nll": round(float(score(view, found, rate, boxes, rng).values["hidden_nll"]), 5),
+                    "point_gradients": float(f"{sampled.point_gradients:.4g}"),
+                    "result": found.result,
+                }
+                append_line(results, line)
+                say(f"{number}, {method.name}: {p:.2f}, handle {line['handle']}, {line['hidden_nll']:.3f} nats")
+    lines = [x for x in newest(read_lines(results), loaded.hash, seed) if x["method"] in names]
+    if not lines:
+        raise ValueError(f"{results} has no results of this prior and these methods; leave --only-chart")
+    drawn = jax.random.normal(jax.random.key(0), (PRIOR_SHAPES, loaded.model.latent))
+    rows = _rows(lines, float(has_handle(loaded.model, drawn).mean()))
+    _draw(lines, out / "handle.png")
+    return rows
+
+
+def _rows(lines: Sequence[Line], prior_says: float) -> list[Row]:
+    """Every method's means, shares by p and differences from the controller's, object by object; shown as a table."""
+    own = [x for x in lines if x["method"] == OWN] or [x for x in lines if x["method"] == lines[0]["method"]]
+    says = {"method": PRIOR, "p": prior_says, "shapes": PRIOR_SHAPES}
+    lines = [*lines, *({**says, "object": x["object"], "handle": x["handle"]} for x in own)]
+    rows, cells = [], []
+    reference: dict[str, dict[int, float]] = {}  # the controller's, by metric and object
+    for method in (*(m.name for m in ASKED), PRIOR):
+        own = [x for x in lines if x["method"] == method]
+        if not own:
+            continue
+        values, objects = _values(own), [x["object"] for x in own]
+        shown = {}
+        for metric, each in values.items():
+            rows += mean_rows("handle", method, BEHIND, metric, each, UNITS[metric])
+            i = interval(each)
+            shown[metric] = f"{i.mean:.3f} ({i.low:.2f}..{i.high:.2f})"
+        for low, high, inside in _bins(values["said"]):
+            for metric in ("said", "true"):
+                told, mean = f"{metric} where p is {low:g} to {high:g}", float(values[metric][inside].mean())
+                rows.append(Row("handle", method, BEHIND, told, mean, "", int(inside.sum())))
+        if method == OWN:
+            reference = {m: dict(zip(objects, each.tolist(), strict=True)) for m, each in values.items()}
+        for metric in [m for m in COMPARED if m in values and method != OWN]:
+            both = [k for k, number in enumerate(objects) if number in reference.get(metric, {})]
+            if not both:
+                continue
+            gap = paired_interval(values[metric][both], np.array([reference[metric][objects[k]] for k in both]))
+            for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
+                rows.append(Row("handle", method, BEHIND, f"{metric}_above_controller{label}", value, "nats", gap.n))
+            shown[f"{metric} above"] = f"{gap.mean:+.3f} ({gap.low:+.3f}..{gap.high:+.3f})"
+        cells.append([method, str(len(own)), *(shown.get(column, "") for column in COLUMNS)])
+    table("Is a handle behind it?", ("method", "n", *COLUMNS), cells)
+    return rows
+
+
+def _values(lines: Sequence[Line]) -> dict[str, Float[np.ndarray, "n"]]:
+    """One method's measures, object by object."""
+    p, true, shapes = (np.array([x[name] for x in lines]) for name in ("p", "handle", "shapes"))
+    values = {"said": p, "true": true * 1.0, "log_score": log_score(p, true, shapes), "brier": (p - true) ** 2}
+    return values | {m: np.array([x[m] for x in lines]) for m in ("hidden_nll", "point_gradients") if m in lines[0]}
+
+
+def _bins(p: Float[np.ndarray, "n"]) -> list[tuple[float, float, Bool[np.ndarray, "n"]]]:
+    """Those of `EDGES` that have any p: low, high, which."""
+    which = np.clip(np.searchsorted(EDGES, p, side="right") - 1, 0, len(EDGES) - 2)
+    return [(low, high, which == b) for b, (low, high) in enumerate(pairwise(EDGES)) if (which == b).any()]
+
+
+def _draw(lines: Sequence[Line], path: Path) -> None:
+    """What each method said of objects with a handle and without; said against true, in bins of what was said."""
+    figure = Figure(figsize=(11, 4.4), layout="constrained")
+    each, bins = figure.subplots(1, 2, width_ratios=(3, 2))
+    names = [m.name for m in ASKED if any(x["method"] == m.name for x in lines)]
+    rng = np.random.default_rng(0)
+    for k, name in enumerate(names):
+        own = [x for x in lines if x["method"] == name]
+        p, true = np.array([x["p"] for x in own]), np.array([x["handle"] for x in own])
+        for side, mark, label in ((False, "o", "none is there"), (True, "^", "a handle is there")):
+            at = k + (0.16 if side else -0.16) + rng.uniform(-0.1, 0.1, np.sum(true == side))
+            face = COLOURS[name] if side else "none"
+            each.plot(at, p[true == side], mark, color=COLOURS[name], mfc=face, ms=5, label=label if k == 0 else None)
+        filled = [inside for _, _, inside in _bins(p) if inside.sum() > 2]
+        share = np.array([true[inside].mean() for inside in filled])
+        error = 1.96 * np.sqrt(share * (1 - share) / np.array([inside.sum() for inside in filled]))
+        said = [p[inside].mean() for inside in filled]
+        bins.errorbar(said, share, error, fmt="o-", color=COLOURS[name], capsize=3, ms=5, label=name)
+    each.set_xticks(range(len(names)), [f"{n}\n({sum(x['method'] == n for x in lines)})" for n in names], fontsize=9)
+    each.set(ylabel="P(a handle is behind)", ylim=(-0.03, 1.03), title="what was said of each object")
+    each.legend(fontsize=9)
+    bins.plot([0, 1], [0, 1], "k--", linewidth=1)
+    bins.set(xlabel="P(a handle is behind)", ylabel="share with one", title="said and true", ylim=(-0.05, 1.05))
+    bins.legend(fontsize=9)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)

@@ -1,0 +1,242 @@
+"""Simulation-based calibration: does the sampler hand back the posterior of its own model?
+
+A position is drawn from the prior N(0, I), pixels from the density that the likelihood evaluates (`draw_pixels`), and
+the sampler answers. Over many such draws the rank of the truth among the posterior's weighted samples is uniform for
+any statistic (Talts et al. 2018); volumes have atoms, so ranks are randomised. Nothing of the world enters, no sensor
+and no shape that the prior does not know: what is wrong here is the sampler's, and what is wrong only elsewhere
+(`farside bench hidden`) is the model's. Statistics, each of the shape on 24^3 voxels:
+
+- volume: of the whole shape; hidden: of its half away from the camera; voxel: whether one random far voxel is solid
+- yaw (where the pose is unknown); delta: mean square of the weights' perturbation, where that is sampled, of which a
+  picture tells next to nothing; log_likelihood of the pixels
+
+The tiny field is a ProbNeRF with the weights that it begins training with: shapes like clouds, and few enough weights
+for 200 draws with delta. The quick sampler is what ships, but that all of its particles start from the prior, as no
+picture is drawn that the encoder could read, and that there is one run.
+
+outside: how far the ranks' distribution function leaves the band that 95% of uniform samples stay in as a whole
+(`metrics.uniform_band`), 0 where it stays inside. coverage90: share of truths in the central 90%.
+
+Ranks are appended to a file, draw by draw, and what is there is not made again.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from matplotlib.figure import Figure
+
+from benchmarks.harness.progress import say, table
+from benchmarks.harness.results import FOLDER, Line, append_line, digest, key, read_lines
+from benchmarks.harness.rows import Row
+from benchmarks.measures.metrics import coverage, ks_distance, randomised_rank, uniform_band
+from probnerf.fields.base import Model
+from probnerf.fields.cylinder import CylinderModel
+from probnerf.inference import InferConfig, likelihood_of, likelihood_settings
+from probnerf.likelihood.dispatch import log_likelihood
+from probnerf.likelihood.pixel_terms import faces_of_view
+from probnerf.likelihood.position import pose_of
+from probnerf.likelihood.settings import Likelihood
+from probnerf.objects.cylinder_scenes import draw_pixels, grid_of_rays
+from probnerf.prior.checkpoint import load_prior
+from probnerf.prior.networks import PRESETS, ProbNeRF
+from probnerf.rendering.occupancy import solid, voxel_centres
+from probnerf.sampling.populations import thin
+from probnerf.sampling.tempered_smc import TemperedSMCConfig, tempered_smc
+from probnerf.shapes import opacity_grids
+from probnerf.types import POSE_SIZE, Posterior
+
+RESULTS = FOLDER / "sbc.jsonl"
+GRID = 24
+POSE_SIGMA = (0.08, 0.08, 0.06, 0.02, 0.03)  # of perception's usual widths, cube units
+STATISTICS = ("volume", "hidden", "voxel", "yaw", "delta", "log_likelihood")
+DRAWS = 64  # posterior samples that ranks are taken among
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A model, what of it is unknown, and a sampler."""
+
+    name: str
+    model: Callable[[], Model]
+    sampler: TemperedSMCConfig
+    pose: bool = True
+    delta: bool = False
+    columns: int = 6  # pixels: columns x rows
+    rows: int = 5
+    lattice: int = 12
+
+
+def _prior() -> Model:
+    return load_prior(None).model
+
+
+def _tiny() -> Model:
+    return ProbNeRF(PRESETS["tiny"], jax.random.key(0))
+
+
+def _on_prior(name: str, sampler: TemperedSMCConfig, pose: bool = True) -> Condition:
+    return Condition(name, _prior, sampler, pose, columns=8, rows=8, lattice=32)
+
+
+THOROUGH = TemperedSMCConfig(populations=2, particles=96, start_particles=768, moves=4, final_stages=2, keep=2)
+QUICK = replace(InferConfig().smc_from_prior, evidence_power=1.0)  # what ships, but for its starts, runs and weights
+CONDITIONS = (
+    Condition("cylinder", CylinderModel, TemperedSMCConfig()),
+    Condition("cylinder, pose known", CylinderModel, TemperedSMCConfig(), pose=False),
+    Condition("tiny field, delta", _tiny, TemperedSMCConfig(), delta=True),
+    Condition("tiny field, delta, pose known", _tiny, TemperedSMCConfig(), pose=False, delta=True),
+    _on_prior("shipped prior, pose known", THOROUGH, pose=False),
+    _on_prior("shipped prior", THOROUGH),
+    Condition("cylinder, quick sampler", CylinderModel, QUICK),
+    _on_prior("shipped prior, quick sampler", QUICK),
+)
+
+
+def _settings(condition: Condition) -> InferConfig:
+    """Inference's, as a density of pixels: no end to the ranges' reach, and each pixel counted once."""
+    return replace(InferConfig(), reach=1e6, power=1.0, sample_delta=condition.delta, lattice=condition.lattice)
+
+
+def statistics(
+    model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "5"], voxel: int
+) -> dict[str, Float[np.ndarray, "s"]]:
+    """Of each position's shape; `voxel` counts those of the far half, which the camera at +x looks at last."""
+    opacity = opacity_grids(model, likelihood, positions, pose_sigma, jnp.ones((GRID,) * 3, bool))
+    shapes = solid(np.asarray(opacity)).reshape(len(positions), -1)
+    far = np.flatnonzero(voxel_centres(GRID)[..., 0].ravel() < 0.0)
+    found = {
+        "volume": shapes.sum(axis=1),
+        "hidden": shapes[:, far].sum(axis=1),
+        "voxel": shapes[:, far[voxel % len(far)]],
+    }
+    rest = positions[:, model.latent :]
+    if likelihood.sample_pose:
+        pose, rest = rest[:, :POSE_SIZE], rest[:, POSE_SIZE:]
+        found["yaw"] = np.asarray(pose_of(pose, pose_sigma).yaw)
+    if likelihood.sample_delta:
+        found["delta"] = np.mean(np.square(np.asarray(rest)), axis=1)
+    return {name: np.asarray(value, np.float64) for name, value in found.items()}
+
+
+def ranks_of(condition: Condition, model: Model, seed: int) -> tuple[dict[str, float], Posterior]:
+    """The truth's randomised ranks in one draw from the model, by statistic, and the posterior."""
+    rng = np.random.default_rng([seed, 41])
+    key = jax.random.key(seed)
+    rays = grid_of_rays(condition.columns, condition.rows, elevation=30.0)
+    pose_sigma = jnp.asarray(POSE_SIGMA if condition.pose else np.zeros(5), jnp.float32)
+    known = jnp.ones(condition.columns * condition.rows, bool)
+    drawn = likelihood_settings(_settings(condition), condition.pose)
+    dim = drawn.dim(model)
+    truth = jax.random.normal(jax.random.fold_in(key, 0), (dim,))
+    observation = draw_pixels(
+        jax.random.fold_in(key, 1), model, drawn, truth, rays, known, jnp.asarray(True), pose_sigma=pose_sigma
+    )
+    likelihood = likelihood_of(_settings(condition), observation, sample_pose=condition.pose)
+    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
+    posterior = tempered_smc(jax.random.fold_in(key, 2), log_likelihood, args, dim, condition.sampler)
+    chosen, weights, _ = thin(posterior, DRAWS)
+    positions = jnp.concatenate([truth[None], posterior.positions[jnp.asarray(chosen)]])
+    found = statistics(model, likelihood, positions, pose_sigma, int(rng.integers(2**31)))
+    found["log_likelihood"] = np.asarray(_value(args, positions), np.float64)
+    ranks = {name: randomised_rank(v[1:], weights, v[0], rng) for name, v in found.items()}
+    return ranks, posterior
+
+
+@jax.jit
+def _value(args, positions):
+    return log_likelihood(args, positions)
+
+
+def identity(condition: Condition, prior: str) -> Line:
+    """What makes a draw of this condition the same one, but for its number."""
+    told = {"sampler": asdict(condition.sampler), "infer": asdict(_settings(condition)), "pose": condition.pose}
+    told |= {"pixels": [condition.columns, condition.rows], "grid": GRID, "draws": DRAWS, "widths": POSE_SIGMA}
+    settings = {"digest": digest(told)}
+    same = {"method": "tempered_smc", "condition": condition.name, "settings": settings, "seed": 0}
+    return {"prior": prior if condition.model is _prior else "", **same}
+
+
+def main(
+    out: Path,
+    quick: bool = False,
+    n: int = 200,
+    conditions: str = "",
+    results: Path = RESULTS,
+    only_chart: bool = False,
+) -> list[Row]:
+    """Simulation-based calibration of tempered SMC: ranks of the truth in draws from the model itself.
+
+    Args:
+        n: draws of each condition
+        conditions: only these, by name, separated by semicolons
+        results: file that ranks are appended to, and read from
+        only_chart: draw what the file holds
+    """
+    if quick:
+        n, results = min(n, 20), out / "sbc.jsonl" if results == RESULTS else results
+    wanted = [c.strip() for c in (conditions or ("cylinder" if quick else "")).split(";") if c.strip()]
+    chosen = [c for c in CONDITIONS if not wanted or c.name in wanted]
+    if len(chosen) < len(wanted):
+        raise ValueError(f"no condition {conditions!r}; there are: {'; '.join(c.name for c in CONDITIONS)}")
+    done = {key(line): line["ranks"] for line in read_lines(results)}
+    prior = load_prior(None).hash
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for condition in chosen:
+        model, ranks, same = condition.model(), [], identity(condition, prior)
+        for seed in range(n):
+            line = {**same, "object": seed}
+            if key(line) not in done and not only_chart:
+                one, posterior = ranks_of(condition, model, seed)
+                done[key(line)] = {name: round(rank, 4) for name, rank in one.items()}
+                append_line(results, {**line, "ranks": done[key(line)], "result": posterior.result})
+                if (seed + 1) % 20 == 0:
+                    say(f"{condition.name}: {seed + 1} of {n} draws ({posterior.result})")
+            if key(line) in done:
+                ranks.append(done[key(line)])
+        if ranks:
+            found[condition.name] = {name: np.array([r[name] for r in ranks]) for name in ranks[0]}
+    if not found:
+        raise ValueError(f"{results} has no ranks of these conditions; leave --only-chart")
+    rows, lines = [], []
+    for name, by in found.items():
+        for statistic, u in by.items():
+            values = {"outside": outside(u), "ks": ks_distance(u), "coverage90": coverage(u)}
+            rows += [Row("sbc", name, statistic, metric, value, "", len(u)) for metric, value in values.items()]
+            lines.append([name, str(len(u)), statistic, *(f"{v:.3f}" for v in values.values())])
+    table("Ranks of the truth", ("condition", "draws", "statistic", "outside", "ks", "coverage90"), lines)
+    _draw(found, out / "sbc.png")
+    return rows
+
+
+def outside(ranks: Float[np.ndarray, "n"], level: float = 0.95) -> float:
+    """The farthest that the ranks' distribution function leaves the simultaneous band that holds `level` of samples."""
+    at, low, high = uniform_band(len(ranks), level)
+    share = np.mean(np.asarray(ranks)[:, None] <= at, axis=0)
+    return float(max(0.0, np.max(low - share), np.max(share - high)))
+
+
+def _draw(found: dict[str, dict[str, np.ndarray]], path: Path) -> None:
+    """Each condition's rank distribution functions, less the uniform one, with the band."""
+    figure = Figure(figsize=(4.2 * min(3, len(found)), 3.4 * -(-len(found) // 3)), layout="constrained")
+    axes = figure.subplots(-(-len(found) // 3), min(3, len(found)), squeeze=False, sharey=True)
+    for ax in axes.ravel()[len(found) :]:
+        ax.set_axis_off()
+    for ax, (name, by) in zip(axes.ravel(), found.items(), strict=False):
+        at, low, high = uniform_band(len(next(iter(by.values()))))
+        ax.fill_between(at, low - at, high - at, color="0.85", label="95% of uniform samples")
+        for statistic, u in by.items():
+            share = np.mean(u[:, None] <= at, axis=0)
+            ax.plot(at, share - at, color=f"C{STATISTICS.index(statistic)}", label=statistic, linewidth=1.2)
+        ax.axhline(0.0, color="k", linewidth=0.6)
+        ax.set(title=name, xlabel="rank of the truth")
+        ax.title.set_fontsize(9)
+    axes[0, 0].set_ylabel("share of ranks below, less uniform")
+    drawn = dict(pair for ax in axes.flat for pair in zip(*reversed(ax.get_legend_handles_labels()), strict=True))
+    axes[0, 0].legend(drawn.values(), drawn.keys(), fontsize=7)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)

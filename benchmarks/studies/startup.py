@@ -1,0 +1,82 @@
+"""How long a start takes: from a new process to a node that may open its camera, with an empty compilation cache and
+with a filled one.
+
+What `farside live` does before its first frame, in a process of its own: imports, the prior, and a rehearsal of what
+inference runs, whose programs are read, or compiled, and not run. What their first run costs besides falls to the first
+object: its first three stages (and their answers) are timed beside those of the same object once more.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.harness.intervals import mean_rows
+from benchmarks.harness.progress import say, table
+from benchmarks.harness.rows import Row
+
+PARTS = ("imports", "prior", "programs", "whole")
+OBJECTS = ("first_object", "again")
+EMPTY, FILLED = "empty cache", "filled cache"
+
+
+def _start(begun: float) -> dict[str, float]:
+    """Seconds of each part, in this new process, which the parent began at `begun` (time.time)."""
+    from perception.inference.tracker import Tracker
+    from perception.inference.warm_up import warm_up
+    from perception.observation.segmentation import segment
+    from perception.sources.open_source import SHIPPED_LOG
+    from perception.sources.recording import Log
+    from probnerf.prior.checkpoint import load_prior
+
+    imported = time.time()
+    prior = load_prior(None)
+    loaded = time.time()
+    warm_up(Tracker(prior))
+    ready = time.time()
+    frame = next(iter(Log(SHIPPED_LOG)))
+    found, ends = segment(frame)[0], [time.time()]
+    for _ in OBJECTS:
+        Tracker(prior).update(frame, found, stages=3, on_answer=lambda _: None)
+        ends.append(time.time())
+    parts = (imported - begun, loaded - imported, ready - loaded, ready - begun, *np.diff(ends))
+    return dict(zip((*PARTS, *OBJECTS), map(float, parts), strict=True))
+
+
+def _started(cache: str) -> dict[str, float]:
+    """`_start` in a new process that compiles into `cache`."""
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": cache, "FARSIDE_PROGRAMS": cache}
+    command = [sys.executable, "-m", "benchmarks.studies.startup", str(time.time())]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if run.returncode != 0:
+        raise RuntimeError(f"{' '.join(command)} ended with {run.returncode}:\n{run.stderr[-2000:]}")
+    return json.loads(run.stdout.splitlines()[-1])
+
+
+def main(out: Path, quick: bool = False, n: int = 5) -> list[Row]:
+    """Seconds from a new process to a node that may open its camera.
+
+    Args:
+        n: starts with a filled cache
+    """
+    with tempfile.TemporaryDirectory() as cache:
+        found = {EMPTY: [_started(cache)]}
+        say(f"{EMPTY}: {found[EMPTY][0]['whole']:.1f} s")
+        found[FILLED] = [_started(cache) for _ in range(1 if quick else n)]
+    rows, lines = [], []
+    for condition, starts in found.items():
+        for part in (*PARTS, *OBJECTS):
+            rows += mean_rows("startup", "node", condition, part, [s[part] for s in starts], "s")
+        medians = (f"{np.median([s[part] for s in starts]):.1f}" for part in (*PARTS, *OBJECTS))
+        lines.append([condition, str(len(starts)), *medians])
+    table("Seconds of a start, medians", ("condition", "starts", *PARTS, *OBJECTS), lines)
+    return rows
+
+
+if __name__ == "__main__":
+    print(json.dumps(_start(float(sys.argv[1]))))

@@ -1,0 +1,160 @@
+"""The frontier: its views show what they should, and a run that was cut goes on where it ended."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks.harness.results import append_line, key, read_lines
+from benchmarks.rivals.methods import CONDITIONS, FULL, METHODS
+from benchmarks.scenes.vessels import ViewConfig, base_rate, vessel_picture, vessel_view
+from benchmarks.studies import frontier
+from benchmarks.studies.frontier_chart import draw_frontier
+from probnerf.objects.tabletop import part_distances
+
+VESSEL = 2_000_001
+LINE = {"prior": "p", "method": "m", "settings": {"a": 1, "b": 2}, "condition": "c", "object": 3, "seed": 0}
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    return {handle: vessel_picture(VESSEL, handle) for handle in ("hidden", "informative")}
+
+
+def _on_handle(view) -> int:
+    """Pixels whose depth lies on the handle rather than on the body, traced anew from the picture alone."""
+    v, u = np.nonzero(view.picture.label == 1)
+    rays = view.camera.rays(np.column_stack([u, v]))
+    points = rays / rays[:, 2:] * view.picture.depth[v, u][:, None]
+    T = np.linalg.inv(view.T_camera_object)
+    points = (points @ T[:3, :3].T + T[:3, 3]) / view.placed.half_extent
+    body, handle = (np.asarray(a) for a in part_distances(view.placed.shape, points.astype(np.float32)))
+    return int(((handle < 0.003) & (body > 0.004)).sum())
+
+
+def test_a_handle_is_hidden_or_shows_clearly(pictures):
+    assert _on_handle(pictures["hidden"]) == 0
+    shown, total = _on_handle(pictures["informative"]), (pictures["informative"].picture.label == 1).sum()
+    assert shown >= 0.95 * max(ViewConfig().shown, ViewConfig().shown_share * total)
+
+
+def test_the_truth_stands_in_each_view_s_own_cube(pictures):
+    """Without depth the cube is another one, and the same solid fills the same cubic metres of it."""
+    views = [vessel_view(pictures["informative"], depth) for depth in (True, False)]
+    assert views[0].frame.depth is not None and views[1].frame.depth is None
+    assert views[0].cube.half_extent != views[1].cube.half_extent
+    volumes = [view.solid.sum() * (view.cube.half_extent / 16) ** 3 for view in views]
+    np.testing.assert_allclose(volumes[1], volumes[0], rtol=0.15)
+    # the handle's place is seen: the body and the handle both lie in the open
+    assert (views[0].seen & views[0].solid & views[0].near_handle).sum() > 5
+
+
+def test_a_last_line_that_was_cut_is_dropped_and_another_one_is_an_error(tmp_path: Path):
+    file = tmp_path / "results.jsonl"
+    assert read_lines(file) == []
+    append_line(file, LINE)
+    append_line(file, {**LINE, "object": 4})
+    whole = file.read_bytes()
+    for cut in (1, 20, len(whole) // 2 - 1):
+        file.write_bytes(whole[:-cut])
+        assert [line["object"] for line in read_lines(file)] == [3]
+        append_line(file, {**LINE, "object": 4})
+        assert file.read_bytes() == whole
+    file.write_bytes(b"{\n" + whole)
+    with pytest.raises(ValueError, match="line 1 is damaged"):
+        read_lines(file)
+
+
+def test_an_answer_that_was_cut_is_not_kept(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        append_line(tmp_path / "results.jsonl", {"result": "interrupted"})
+    assert not list(tmp_path.iterdir())
+    append_line(tmp_path / "results.jsonl", {"result": "converged"})
+    assert (tmp_path / "results.jsonl").read_text() == '{"result": "converged"}\n'
+
+
+def test_the_order_of_settings_makes_no_other_result():
+    assert key(LINE) == key({**LINE, "settings": {"b": 2, "a": 1}})
+    assert key(LINE) != key({**LINE, "settings": {"b": 2, "a": 2}})
+
+
+def _found(nll: float) -> dict:
+    metrics = dict.fromkeys(("psnr_heldout", "psnr_heldout_of_mean", "psnr_given", "psnr_given_of_mean"), 20.0)
+    costs = {"seconds": 2.0, "gflops": 50.0, "point_gradients": 1e6, "point_evaluations": 0.0}
+    boxes = {"ranks": [0.2, 0.99], "p_free": [0.99, 0.1], "occupied": [0, 1]}
+    return {"hidden_nll": nll, **metrics, **costs, **boxes, "result": "stages"}
+
+
+def test_a_run_goes_on_where_it_was_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """One vessel of two has no informative view and perception refuses another's colour; Ctrl-C comes in between."""
+    made: list[tuple] = []
+
+    def picture(seed, handle):
+        return None if (seed, handle) == (11, "informative") else seed
+
+    def view(seed, depth):
+        if seed == 10 and not depth:
+            raise ValueError("its foot is hidden")
+        return seed
+
+    def one(method, question, *_):
+        if len(made) == 7:
+            made.append(())
+            raise KeyboardInterrupt
+        made.append((question.view, method.name))
+        return _found(0.3 if method.name == FULL else 0.4 + 0.01 * question.view)
+
+    monkeypatch.setattr(frontier, "TEST_SEEDS", range(10, 99))
+    monkeypatch.setattr(frontier, "vessel_picture", picture)
+    monkeypatch.setattr(frontier, "vessel_view", view)
+    monkeypatch.setattr(frontier, "_one", one)
+    monkeypatch.setattr(frontier, "base_rate", lambda **_: None)
+    monkeypatch.setattr(frontier, "draw_frontier", lambda *_: None)
+    out, file = tmp_path / "out", tmp_path / "results.jsonl"
+
+    def run(**options):
+        return frontier.main(out, n=2, methods="map;paper 100x100;fixed*", results=file, **options)
+
+    run()
+    assert len(made) == 8 and made[-1] == ()  # cut
+    file.write_bytes(file.read_bytes()[:-9])
+    rows = run()
+    assert made.count((10, "map")) == 2 and made.count((12, "map")) == 4 and made.count((12, FULL)) == 5
+    assert len(made) == 8 + 8  # what was cut off the file, and what was left
+    assert repr(run(only_chart=True)) == repr(run()) == repr(rows) and len(made) == 16
+    value = {(r.condition, r.method, r.metric): r for r in rows}
+    gap = value["hidden, RGB-D", "map", "hidden_nll_above_paper"]
+    assert gap.value == pytest.approx(0.21) and gap.n == 2
+    assert value["hidden, colour only", "map", "hidden_nll"].n == 1  # the other one was refused
+    assert {r.condition for r in rows if r.method == "fixed 20x100"} == {CONDITIONS[0]}
+    assert value["hidden, RGB-D", "map", "coverage90"].value == 0.5
+    assert value["hidden, RGB-D", "map", "work"].value == pytest.approx(0.1)
+    overall = {r.metric: r for r in rows if (r.condition, r.method) == (frontier.OVER_ALL, "map")}
+    assert overall["hidden_nll_above_paper"].value == pytest.approx(0.22)  # of the vessel that all answered
+    assert overall["hidden_nll"].n == 1 and overall["fewer_point_gradients"].value == overall["less_work"].value == 1.0
+    assert not any(r.condition == frontier.OVER_ALL and r.method == "fixed 20x100" for r in rows)
+    draw_frontier([row for row in rows if row.condition == CONDITIONS[0]], out / "frontier.png")
+    assert cv2.imread(str(out / "frontier.png")) is not None
+    with pytest.raises(ValueError, match="no method 'nothing'"):
+        frontier.main(out, methods="nothing", results=file)
+
+
+def test_every_method_is_another_one():
+    assert len({m.name for m in METHODS}) == len(METHODS)
+    assert all(set(m.conditions) <= set(CONDITIONS) for m in METHODS)
+
+
+@pytest.mark.slow
+def test_two_methods_answer_one_view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    config = replace(frontier.ControllerConfig(), hypotheses=4)
+    monkeypatch.setattr(frontier, "ControllerConfig", lambda: config)
+    monkeypatch.setattr(frontier, "base_rate", lambda **_: base_rate(24))
+    rows = frontier.main(tmp_path, quick=True, methods="encoder;paper 10x10")
+    value = {(r.method, r.metric): r.value for r in rows}
+    for method in ("encoder alone", "paper 10x10"):
+        assert 0.0 < value[method, "hidden_nll"] < 3.0 and 5.0 < value[method, "psnr_heldout"] < 40.0
+        assert value[method, "psnr_heldout_of_mean"] >= value[method, "psnr_heldout"]  # the mean square is convex
+        assert value[method, "seconds"] > 0.0
+    assert value["encoder alone", "point_gradients"] == 0.0 < value["paper 10x10", "point_gradients"]
