@@ -69,7 +69,7 @@ def mesh_view(path: Path, seed: int, config: ViewConfig | None = None) -> Vessel
     frame = sense(picture, camera, T, seed)
     found = segment(frame, 1)[0]
     cube = object_frame(frame, found, ObserveConfig())
-    faultless = Frame(0, frame.frame_id, frame.rgb, picture.depth.astype(np.float32), None, camera)
+    faultless = Frame(frame.rgb, picture.depth.astype(np.float32), camera, frame_id=frame.frame_id)
     inverse = np.linalg.inv(T)
     in_cube = cube.to_cube(cloud.points @ inverse[:3, :3].T + inverse[:3, 3])
     return VesselView(

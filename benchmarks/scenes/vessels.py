@@ -139,7 +139,7 @@ def vessel_view(
         cube = object_frame(frame, found, ObserveConfig())
     # Without depth no pixel sees where the object is: scored behind its true surface alone, voxels would tell that
     true_depth = picture.picture.depth.astype(np.float32) if depth else None
-    faultless = Frame(0, frame.frame_id, frame.rgb, true_depth, None, camera)
+    faultless = Frame(frame.rgb, true_depth, camera, frame_id=frame.frame_id)
     T_canonical_view = _affine(cube, picture.T_camera_object, placed.half_extent)
     body, handle = (np.asarray(a) for a in _parts(placed.shape, T_canonical_view, FINE))
     swept = np.asarray(_swept(placed.shape, T_canonical_view, GRID))

@@ -229,7 +229,7 @@ def _mask(
         return mask_by_depth(view, pose.T_plate_camera, board, MaskConfig())
     if background is None:
         return mask_by_picture(view, pose.T_plate_camera, board, None, MaskConfig())
-    empty = Frame(0, frame.frame_id, background, None, None, frame.camera)
+    empty = Frame(background, None, frame.camera, frame_id=frame.frame_id)
     try:
         where = locate_plate(board, empty.camera, empty.rgb).T_plate_camera
     except PlateNotFoundError as error:

@@ -152,7 +152,7 @@ class TopicSource:
     def _frame(self, colour: Any, depth: Any, camera: Camera) -> Frame:
         rgb = to_rgb(colour)
         metres = None if depth is None else to_depth(depth)
-        return Frame(stamp_ns(colour), colour.header.frame_id, rgb, metres, None, camera)
+        return Frame(rgb, metres, camera, stamp_ns=stamp_ns(colour), frame_id=colour.header.frame_id)
 
     def _note(self, text: str) -> None:
         if text.partition(":")[0] not in {note.partition(":")[0] for note in self.notes}:

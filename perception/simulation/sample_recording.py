@@ -31,7 +31,7 @@ def frames() -> Iterator[Frame]:
     picture = render(SCENE, CAMERA, T_WORLD_CAMERA)
     for i in range(FRAMES):
         frame = sense(picture, CAMERA, T_WORLD_CAMERA, seed=i, config=SENSOR, stamp_ns=START_NS + i * STEP_NS)
-        yield Frame(frame.stamp_ns, frame.frame_id, frame.rgb, frame.depth, None, frame.camera)
+        yield Frame(frame.rgb, frame.depth, frame.camera, stamp_ns=frame.stamp_ns, frame_id=frame.frame_id)
 
 
 if __name__ == "__main__":

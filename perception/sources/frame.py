@@ -1,49 +1,70 @@
 """Frame, the one type that every source gives, and the protocol of a source."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32, UInt8
+from jaxtyping import Float, Float32, Int32, Shaped, UInt8
 
 from calibration.camera import Camera
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Frame:
-    """One picture with its camera. Colour, depth and label share pixels. Raises `ValueError` where they do not."""
+    """One picture with its camera. Colour, depth and label share pixels.
 
-    stamp_ns: int
-    frame_id: str
+    `camera` may be given as its 3x3 matrix K (px; pixel centres at whole numbers), for a lens without distortion.
+    Raises `ValueError` where sizes or types do not fit.
+    """
+
     rgb: UInt8[np.ndarray, "h w 3"]
     depth: Float32[np.ndarray, "h w"] | None  # m along z, NaN where unknown
-    label: Int32[np.ndarray, "h w"] | None  # object id per pixel, 0 for none
     camera: Camera
-    T_world_camera: Float[np.ndarray, "4 4"] | None = None
+    label: Int32[np.ndarray, "h w"] | None  # object id per pixel, 0 for none
+    stamp_ns: int  # since the epoch
+    frame_id: str  # of the camera's optical frame: x right, y down, z forward
+    T_world_camera: Float[np.ndarray, "4 4"] | None  # p_world = T_world_camera @ p_camera, metres
 
-    def __post_init__(self) -> None:
-        rgb = np.asarray(self.rgb)
+    def __init__(
+        self,
+        rgb: UInt8[np.ndarray, "h w 3"],
+        depth: Shaped[np.ndarray, "h w"] | None,
+        camera: Camera | Float[np.ndarray, "3 3"],
+        label: Shaped[np.ndarray, "h w"] | None = None,
+        stamp_ns: int = 0,
+        frame_id: str = "camera",
+        T_world_camera: Float[np.ndarray, "4 4"] | None = None,
+    ) -> None:
+        rgb = np.asarray(rgb)
         if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
             raise ValueError(f"colour is {rgb.dtype}{list(rgb.shape)}; uint8[height, width, 3] wanted")
         height, width = rgb.shape[:2]
-        if (self.camera.width, self.camera.height) != (width, height):
+        if not isinstance(camera, Camera):
+            camera = Camera(width, height, camera, np.zeros(5))
+        if (camera.width, camera.height) != (width, height):
             raise ValueError(
-                f"the camera is calibrated at {self.camera.width}x{self.camera.height} px but colour is"
+                f"the camera is calibrated at {camera.width}x{camera.height} px but colour is"
                 f" {width}x{height} px; use the calibration of this image size"
             )
-        for name, dtype in (("depth", np.float32), ("label", np.int32)):
-            plane = getattr(self, name)
-            if plane is None:
-                continue
-            if plane.shape != (height, width):
-                size = "x".join(map(str, plane.shape[::-1]))
-                raise ValueError(f"{name} is {size} px but colour is {width}x{height}; align {name} to colour")
-            object.__setattr__(self, name, np.asarray(plane, dtype=dtype))
-        if self.depth is not None:  # a sensor's zero or infinity is no distance
+        if depth is not None:  # a sensor's zero or infinity is no distance
+            depth = _plane("depth", depth, np.float32, rgb)
             with np.errstate(invalid="ignore"):
-                valid = np.isfinite(self.depth) & (self.depth > 0)
-            object.__setattr__(self, "depth", np.where(valid, self.depth, np.float32(np.nan)))
+                depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan))
+        if label is not None:
+            label = _plane("label", label, np.int32, rgb)
+        values = (rgb, depth, camera, label, stamp_ns, frame_id, T_world_camera)
+        for field_, value in zip(fields(self), values, strict=True):
+            object.__setattr__(self, field_.name, value)
+
+
+def _plane(name: str, values: Shaped[np.ndarray, "h w"], dtype: type, rgb: UInt8[np.ndarray, "h w 3"]) -> np.ndarray:
+    """One value a pixel of `rgb`. Raises `ValueError` for another size."""
+    plane: np.ndarray = np.asarray(values, dtype=dtype)
+    if plane.shape != rgb.shape[:2]:
+        size = "x".join(map(str, plane.shape[::-1]))
+        raise ValueError(f"{name} is {size} px but colour is {rgb.shape[1]}x{rgb.shape[0]}; align {name} to colour")
+    return plane
 
 
 class Source(Protocol):

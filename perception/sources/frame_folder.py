@@ -56,7 +56,15 @@ def read_frame_folder(path: Path | str) -> Frame:
     except ValueError as error:
         raise ValueError(f"{path / 'meta.json'}: {error}") from None
     label = None if label is None else label.astype(np.int32)
-    return Frame(meta["stamp_ns"], meta["frame_id"], rgb, depth, label, camera, meta["T_world_camera"])
+    return Frame(
+        rgb,
+        depth,
+        camera,
+        label=label,
+        stamp_ns=meta["stamp_ns"],
+        frame_id=meta["frame_id"],
+        T_world_camera=meta["T_world_camera"],
+    )
 
 
 def write_frame_folder(path: Path | str, frame: Frame) -> None:

@@ -185,7 +185,7 @@ class OakSource:
         try:
             camera = self._agreed(opened.camera, colour) if opened.factory else opened.camera
             z = depth.getFrame().astype(np.uint16, copy=False) * _METRES
-            return Frame(stamp_ns, "oak_rgb_camera_optical_frame", rgb, z, None, camera), number
+            return Frame(rgb, z, camera, stamp_ns=stamp_ns, frame_id="oak_rgb_camera_optical_frame"), number
         except ValueError as error:
             raise ValueError(f"{self._images.name}: {error}") from None
 

@@ -202,7 +202,15 @@ class Log:
             z = to_depth(depth.message) if depth else None  # Frame turns 0 into NaN
             ids = to_label(label.message) if label else None
             T = to_transform(pose.message) if pose else None
-            return Frame(colour.stamp, colour.message.header.frame_id, to_rgb(colour.message), z, ids, camera, T)
+            return Frame(
+                to_rgb(colour.message),
+                z,
+                camera,
+                label=ids,
+                stamp_ns=colour.stamp,
+                frame_id=colour.message.header.frame_id,
+                T_world_camera=T,
+            )
         except ValueError as error:
             raise ValueError(f"{self.path}: frame at {colour.stamp} ns: {error}") from None
 

@@ -67,7 +67,7 @@ class _Pictures:
         camera = self._given or self._guess
         assert camera is not None
         rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB) if bgr.ndim == 3 else cv2.cvtColor(bgr, cv2.COLOR_GRAY2RGB)
-        return Frame(stamp_ns, "camera", rgb, None, None, camera)
+        return Frame(rgb, None, camera, stamp_ns=stamp_ns)
 
 
 class Webcam(_Pictures):

@@ -64,12 +64,10 @@ def picture(*things: Cylinder, T: np.ndarray | None = None, noise: float = 1.0, 
     colours = np.array([[200, 190, 170], [220, 40, 30], [30, 60, 220], [40, 180, 60]], np.uint8)
     shape = (CAMERA.height, CAMERA.width)
     return Frame(
-        0,
-        "camera",
         colours[ids].reshape(*shape, 3),
         depth.reshape(shape).astype(np.float32),
-        ids.reshape(shape) if label else None,
         CAMERA,
+        label=ids.reshape(shape) if label else None,
     )
 
 

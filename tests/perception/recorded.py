@@ -42,7 +42,7 @@ def some_frames(count: int, camera: Camera = CAMERA, period_ms: int = 33) -> lis
         mm = (rng.integers(1, 65536, shape) * (rng.random(shape) > 0.2)).astype(np.uint16)
         stamp_ns = CLOCK_NS + 7_000_123_000 + i * period_ms * 1_000_000
         rgb = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
-        frames.append(Frame(stamp_ns, "camera", rgb, mm * np.float32(1e-3), None, camera))
+        frames.append(Frame(rgb, mm * np.float32(1e-3), camera, stamp_ns=stamp_ns))
     return frames
 
 

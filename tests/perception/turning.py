@@ -77,4 +77,4 @@ def _frame(scene: Turning, angle: float) -> Frame:
         rgb[:] = 120.0
     z = z + 0.001 * rng.standard_normal(z.shape)
     depth = np.where(rng.random(z.shape) < 0.01, np.nan, z).astype(np.float32) if scene.depth else None
-    return Frame(0, "camera", np.clip(np.rint(rgb), 0, 255).astype(np.uint8), depth, hit.astype(np.int32), camera)
+    return Frame(np.clip(np.rint(rgb), 0, 255).astype(np.uint8), depth, camera, label=hit.astype(np.int32))

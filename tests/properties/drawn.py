@@ -57,7 +57,7 @@ def every_field(kind: type[Any_], together: st.SearchStrategy | None = None, **o
     hints = get_type_hints(kind)
 
     def build(given: Mapping[str, Any]) -> st.SearchStrategy[Any_]:
-        values = {f.name: own.get(f.name) for f in fields(kind) if f.name not in given}  # type: ignore[arg-type]
+        values = {f.name: own.get(f.name) for f in fields(kind) if f.name not in given}
         drawn = {name: by_type(hints[name]) if value is None else value for name, value in values.items()}
         return st.builds(kind, **drawn, **{name: st.just(value) for name, value in given.items()})
 

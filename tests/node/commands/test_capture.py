@@ -187,7 +187,7 @@ def test_frames_that_waited_are_passed_over() -> None:
         def __iter__(self) -> Iterator[Frame]:
             blank = Turning(block=False).frame(0.0)
             for stamp in range(1_000_000, 1_000_000 + 40_000, 10):
-                yield Frame(stamp, "c", blank.rgb, None, None, blank.camera)
+                yield Frame(blank.rgb, None, blank.camera, stamp_ns=stamp, frame_id="c")
 
     frames = FreshFrames(Queue(), clock=lambda: now[0])
     now[0] += 2_000

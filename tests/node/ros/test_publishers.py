@@ -57,7 +57,7 @@ def test_a_frame_comes_back_from_the_bus() -> None:
     rgb = rng.integers(0, 256, (120, 160, 3), dtype=np.uint8)
     depth = rng.uniform(0.2, 2.0, (120, 160)).astype(np.float32)
     depth[:5] = np.nan
-    sent = Frame(1_700_000_000_123_456_789, "oak", rgb, depth, None, CAMERA)
+    sent = Frame(rgb, depth, CAMERA, stamp_ns=1_700_000_000_123_456_789, frame_id="oak")
     topics = TopicConfig("~/color/image_raw", "~/depth/image_raw", "~/color/camera_info", end_s=20.0)
     with Bus(BusConfig()) as bus:
         source, announcer = TopicSource(bus, topics), Announcer(bus)

@@ -22,7 +22,7 @@ def truth(frame: Frame) -> np.ndarray:
     """The block's pixels in the square."""
     assert frame.label is not None
     depth = (frame.label + 1).astype(np.float32)
-    return square(Frame(0, "c", frame.rgb, depth, None, frame.camera)).depth > 1.5
+    return square(Frame(frame.rgb, depth, frame.camera, frame_id="c")).depth > 1.5
 
 
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
@@ -37,7 +37,7 @@ def test_a_square_shows_what_the_rays_of_the_frame_see() -> None:
     rays = camera.rays(np.column_stack([u.ravel(), v.ravel()]))
     colour = np.rint(127 + 120 * np.stack([rays[:, 0], rays[:, 1], rays[:, 0] - rays[:, 1]], -1)).astype(np.uint8)
     frame = Frame(
-        0, "c", colour.reshape(120, 160, 3), (rays[:, 2] * 2).reshape(120, 160).astype(np.float32), None, camera
+        colour.reshape(120, 160, 3), (rays[:, 2] * 2).reshape(120, 160).astype(np.float32), camera, frame_id="c"
     )
     view = square(frame)
     assert view.side == 120 and view.inside[5:-5, 5:-5].all() and view.depth is not None

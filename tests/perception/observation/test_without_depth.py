@@ -125,7 +125,9 @@ def standardised(seed: int, height_sigma: float, tilt_sigma: float) -> np.ndarra
     supposed = T.copy()
     supposed[:3, :3] = T[:3, :3] @ cv2.Rodrigues(np.array([np.radians(tilt_sigma) * rng.normal(), 0, 0]))[0]
     supposed[2, 3] += height_sigma * rng.normal()
-    frame = Frame(0, "", (255 * seen.rgb).astype(np.uint8), None, seen.label, camera, supposed)
+    frame = Frame(
+        (255 * seen.rgb).astype(np.uint8), None, camera, label=seen.label, frame_id="", T_world_camera=supposed
+    )
     guess = PlaneGuess(height_sigma=height_sigma, tilt_sigma=tilt_sigma)
     try:
         found = segment(frame, 1, SegmentConfig(guess=guess))[0]

@@ -41,7 +41,7 @@ def in_cube(frame: Frame, pixels: np.ndarray, placed: Placed, T_camera_object: n
 def test_depth_lies_on_the_true_surfaces(picture: Picture) -> None:
     """Through a lens with distortion, and through `truth`."""
     assert set(np.unique(picture.label)) == {0, 1, 2}
-    frame = Frame(0, "", np.zeros((120, 160, 3), np.uint8), picture.depth.astype(np.float32), None, CAMERA)
+    frame = Frame(np.zeros((120, 160, 3), np.uint8), picture.depth.astype(np.float32), CAMERA, frame_id="")
     for i, (placed, T) in enumerate(zip(SCENE.objects, truth(SCENE, T_WORLD_CAMERA), strict=True), start=1):
         cube = in_cube(frame, picture.label == i, placed, T)
         assert np.abs(np.asarray(signed_distance(placed.shape, cube.astype(np.float32)))).max() < 3e-3
@@ -130,7 +130,7 @@ def test_shipped_mug_is_found_and_its_handle_is_hidden(shipped_frames: list[Fram
     assert mug.occluder.any()
     assert bool(sample_recording.MUG.shape.has_handle)
     T = truth(sample_recording.SCENE, sample_recording.T_WORLD_CAMERA)[0]
-    clean = Frame(0, "", shipped_frames[0].rgb, shipped_picture.depth.astype(np.float32), None, sample_recording.CAMERA)
+    clean = Frame(shipped_frames[0].rgb, shipped_picture.depth.astype(np.float32), sample_recording.CAMERA, frame_id="")
     cube = in_cube(clean, shipped_picture.label == 1, sample_recording.MUG, T).astype(np.float32)
     body, handle = map(np.asarray, part_distances(sample_recording.MUG.shape, cube))
     assert (handle < body).mean() < 0.001  # no pixel sees it

@@ -177,7 +177,7 @@ def test_a_frame_comes_back_as_it_was_written(tmp_path: Path, known: bool) -> No
 def test_far_depth_is_kept_far(tmp_path: Path) -> None:
     depth = np.full((48, 64), 20.0, np.float32)
     depth[0, 0] = 100.0
-    frame = Frame(0, "camera", np.zeros((48, 64, 3), np.uint8), depth, None, Camera(64, 48, np.array(K), np.zeros(5)))
+    frame = Frame(np.zeros((48, 64, 3), np.uint8), depth, Camera(64, 48, np.array(K), np.zeros(5)))
     write_frame_folder(tmp_path, frame)
     back = read_frame_folder(tmp_path).depth
     assert back[0, 0] == pytest.approx(65.535) and (back.ravel()[1:] == np.float32(20.0)).all()
@@ -185,7 +185,7 @@ def test_far_depth_is_kept_far(tmp_path: Path) -> None:
 
 def test_what_a_folder_cannot_hold_is_refused(tmp_path: Path) -> None:
     camera = Camera(64, 48, np.array(K), np.zeros(5))
-    frame = Frame(7, "c", np.zeros((48, 64, 3), np.uint8), None, None, camera)
+    frame = Frame(np.zeros((48, 64, 3), np.uint8), None, camera, stamp_ns=7, frame_id="c")
     write_frame_folder(tmp_path / "without", frame)
     back = read_frame_folder(tmp_path / "without")
     assert back.depth is None and back.stamp_ns == 7
@@ -204,11 +204,11 @@ def test_a_frame_refuses_planes_of_other_sizes() -> None:
     camera = Camera(64, 48, np.array(K), np.zeros(5))
     rgb = np.zeros((48, 64, 3), np.uint8)
     with pytest.raises(ValueError, match="depth is 32x24 px but colour is 64x48"):
-        Frame(0, "c", rgb, np.ones((24, 32), np.float32), None, camera)
+        Frame(rgb, np.ones((24, 32), np.float32), camera, frame_id="c")
     with pytest.raises(ValueError, match="calibrated at 64x48"):
-        Frame(0, "c", np.zeros((24, 32, 3), np.uint8), None, None, camera)
+        Frame(np.zeros((24, 32, 3), np.uint8), None, camera, frame_id="c")
     depth = np.array([0.0, -1.0, np.inf, np.nan, 1.5], np.float32).repeat(64 * 48 // 5 + 1)[: 64 * 48].reshape(48, 64)
-    frame = Frame(0, "c", rgb, depth, None, camera)
+    frame = Frame(rgb, depth, camera, frame_id="c")
     assert set(frame.depth[np.isfinite(frame.depth)]) == {1.5}
 
 

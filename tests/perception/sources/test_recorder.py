@@ -41,13 +41,13 @@ def frame(i: int, unit: float = 0.0, label: bool = True, pose: bool = True) -> F
     T[:3, :3] = Rotation.from_rotvec([0.1 * i, 0.2, -0.3]).as_matrix()
     T[:3, 3] = [0.1 * i, -2.0, 0.5]
     return Frame(
-        START + i * 33_333_333,
-        "camera_color",
         rng.integers(0, 256, (48, 64, 3), dtype=np.uint8),
         depth,
-        rng.integers(0, 900 if i % 2 else 9, (48, 64)).astype(np.int32) if label else None,
         RATIONAL,
-        T if pose else None,
+        label=rng.integers(0, 900 if i % 2 else 9, (48, 64)).astype(np.int32) if label else None,
+        stamp_ns=START + i * 33_333_333,
+        frame_id="camera_color",
+        T_world_camera=T if pose else None,
     )
 
 
@@ -98,7 +98,7 @@ def test_what_comes_after_the_end_is_ignored(tmp_path: Path) -> None:
 
 
 def test_what_a_frame_lacks_stays_absent(tmp_path: Path) -> None:
-    bare = Frame(START, "cam", frame(0).rgb, None, None, RATIONAL)
+    bare = Frame(frame(0).rgb, None, RATIONAL, stamp_ns=START, frame_id="cam")
     record(tmp_path / "bare.mcap", [bare])
     (read,) = Log(tmp_path / "bare.mcap")
     assert (read.depth, read.label, read.T_world_camera) == (None, None, None)

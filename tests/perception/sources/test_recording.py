@@ -30,7 +30,7 @@ def frames(count: int = 3, label: bool = True) -> list[Frame]:
         depth = rng.uniform(0.3, 5.0, (48, 64)).astype(np.float32)
         depth[rng.random((48, 64)) < 0.2] = np.nan
         ids = rng.integers(0, 9 if i % 2 else 900, (48, 64)).astype(np.int32) if label else None
-        out.append(Frame(START + i * 33_333_333, "camera_color", rgb, depth, ids, CAMERA))
+        out.append(Frame(rgb, depth, CAMERA, label=ids, stamp_ns=START + i * 33_333_333, frame_id="camera_color"))
     return out
 
 
@@ -165,7 +165,7 @@ def test_writing_that_fails_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_frames_without_depth_or_in_world_pass(tmp_path: Path) -> None:
-    frame = Frame(START, "cam", RGB, None, None, CAMERA)
+    frame = Frame(RGB, None, CAMERA, stamp_ns=START, frame_id="cam")
     write_log(tmp_path / "a.mcap", [frame])
     log = Log(tmp_path / "a.mcap")
     (read,) = log
