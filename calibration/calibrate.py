@@ -155,10 +155,10 @@ def _fit(views: Sequence[View], size: tuple[int, int], model: Model) -> tuple[Ca
         rvec, tvec = np.reshape(rvec, 3), np.reshape(tvec, 3)
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = cv2.Rodrigues(rvec)[0], tvec
-        predicted, jacobian = _project(view.points, rvec, tvec, camera)
+        predicted, *jacobian = camera.project_posed(view.points, rvec, tvec)
         fitted.append(FittedView(view, T, view.pixels - predicted))
         residuals.append((view.pixels - predicted).ravel())
-        jacobians.append(jacobian)
+        jacobians.append(tuple(jacobian))
     rss = float((np.concatenate(residuals) ** 2).sum())
     count = sum(len(r) for r in residuals)
     free = max(count - 4 - len(D) - 6 * len(views), 1)
@@ -189,19 +189,6 @@ def _fit_fisheye(points: list[np.ndarray], pixels: list[np.ndarray], size: tuple
     if not fits:
         raise complaint
     return min(fits, key=lambda fit: fit[0])[1:]
-
-
-def _project(
-    points: Float[np.ndarray, "n 3"], rvec: Float[np.ndarray, "3"], tvec: Float[np.ndarray, "3"], camera: Camera
-) -> tuple[Float[np.ndarray, "n 2"], tuple[Float[np.ndarray, "m p"], Float[np.ndarray, "m 6"]]]:
-    """Pixels, and their derivatives by (fx, fy, cx, cy, distortion) and by the pose."""
-    if camera.model == "equidistant":
-        px, J = cv2.fisheye.projectPoints(points.reshape(1, -1, 3), rvec, tvec, camera.K, camera.distortion)
-        inner, outer = J[:, :8], J[:, 8:14]
-    else:
-        px, J = cv2.projectPoints(points, rvec, tvec, camera.K, camera.distortion)[:2]
-        inner, outer = J[:, 6 : 10 + len(camera.distortion)], J[:, :6]
-    return np.reshape(px, (-1, 2)), (inner, outer)
 
 
 def _deviations(

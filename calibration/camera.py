@@ -97,6 +97,22 @@ class Camera:
         px[~(xyz[:, 2] > 0)] = np.nan
         return px
 
+    def project_posed(
+        self, points: Float[np.ndarray, "n 3"], turn: Float[np.ndarray, "3"], shift: Float[np.ndarray, "3"]
+    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m p"], Float[np.ndarray, "m 6"]]:
+        """Pixels of a body's points, and their derivatives by the intrinsics and by the pose.
+
+        The pose is T_camera_body as a rotation vector `turn` and a `shift` (the unit of `points`); m = 2n rows are
+        x and y of each point in turn. Intrinsics are (fx, fy, cx, cy, distortion), the pose is (turn, shift).
+        """
+        if self.model == "equidistant":
+            px, J = cv2.fisheye.projectPoints(points.reshape(1, -1, 3), turn, shift, self.K, self.distortion)
+            inner, outer = J[:, :8], J[:, 8:14]
+        else:
+            px, J = cv2.projectPoints(points, turn, shift, self.K, self.distortion)[:2]
+            inner, outer = J[:, 6 : 10 + len(self.distortion)], J[:, :6]
+        return np.reshape(px, (-1, 2)), inner, outer
+
     def _radius(self, theta: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """The fisheye's radius (focal lengths) at the angle theta from the axis."""
         return theta * np.polynomial.polynomial.polyval(theta**2, [1.0, *self.distortion])

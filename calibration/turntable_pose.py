@@ -15,6 +15,7 @@ from calibration.camera import Camera
 
 _WORST_PX = 2.0  # mean distance of corners from where the pose puts them
 _LEAST_SPREAD = 0.5  # squares: standard deviation of the corners across their longest line
+_STEPS, _STEP_END = 50, 1e-10  # of the pose's fit; rad and m
 
 
 class PlateNotFoundError(ValueError):
@@ -49,18 +50,43 @@ def locate_plate(board: Board, camera: Camera, rgb: UInt8[np.ndarray, "h w 3"]) 
     spread = np.linalg.svd(points[:, :2] - points[:, :2].mean(axis=0), compute_uv=False)[1] / np.sqrt(count)
     if spread < _LEAST_SPREAD * board.square:
         raise PlateNotFoundError(f"the {count} corners found lie almost in a line; show more of the board")
-    found, turn, shift = cv2.solvePnP(points, pixels, camera.K, camera.distortion, flags=cv2.SOLVEPNP_IPPE)
-    if not found:
+    fitted = _fit_pose(points, pixels, camera)
+    if fitted is None:
         raise PlateNotFoundError(f"no pose fits the {count} corners found; check the camera's calibration")
-    turn, shift = cv2.solvePnPRefineLM(points, pixels, camera.K, camera.distortion, turn, shift)
-    T_camera_board = np.eye(4)
-    T_camera_board[:3, :3], T_camera_board[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
-    again = cv2.projectPoints(points, turn, shift, camera.K, camera.distortion)[0].reshape(-1, 2)
-    rms = float(np.sqrt(np.mean(np.sum((again - pixels) ** 2, axis=1))))
+    T_camera_board, rms = fitted
     T_plate_camera = np.linalg.inv(T_camera_board @ T_board_plate(board))
     if rms > _WORST_PX or T_plate_camera[2, 3] <= 0:
         raise PlateNotFoundError(f"the board's corners are {rms:.1f} px off their pose; check the camera's calibration")
     return PlatePose(T_plate_camera, count, rms)
+
+
+def _fit_pose(
+    points: Float[np.ndarray, "n 3"], pixels: Float[np.ndarray, "n 2"], camera: Camera
+) -> tuple[Float[np.ndarray, "4 4"], float] | None:
+    """T_camera_board of a flat board by least squares in pixels, through the camera's own lens, and its rms (px)."""
+    rays = camera.rays(pixels)
+    seen = np.isfinite(rays).all(axis=1)
+    if seen.sum() < FEWEST_CORNERS:
+        return None
+    ideal = rays[seen, :2] / rays[seen, 2:]
+    found, turn, shift = cv2.solvePnP(points[seen], ideal, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
+    if not found:
+        return None
+    pose, best = np.concatenate([turn.ravel(), shift.ravel()]), np.inf
+    step = np.zeros(6)
+    for _ in range(_STEPS):  # Gauss-Newton; a step that does not lower the error is halved
+        px, _, J = camera.project_posed(points, pose[:3] + step[:3], pose[3:] + step[3:])
+        error = float(np.sum((px - pixels) ** 2))
+        if not error < best:
+            step = 0.5 * step
+            continue
+        pose, best = pose + step, error
+        step = np.linalg.lstsq(J, (pixels - px).ravel(), rcond=None)[0]
+        if np.abs(step).max() < _STEP_END:
+            break
+    T_camera_board = np.eye(4)
+    T_camera_board[:3, :3], T_camera_board[:3, 3] = cv2.Rodrigues(pose[:3])[0], pose[3:]
+    return T_camera_board, float(np.sqrt(best / len(points)))
 
 
 def turned(T_plate_first: Float[np.ndarray, "4 4"], T_plate_second: Float[np.ndarray, "4 4"]) -> float:

@@ -55,7 +55,9 @@ def square(frame: Frame) -> Square:
     camera = frame.camera
     side, focal = min(camera.width, camera.height), float(camera.K[1, 1])
     blank = Square(np.zeros((side, side, 3), np.uint8), None, np.zeros((side, side), bool), focal)
-    x, y = cv2.initUndistortRectifyMap(camera.K, camera.distortion, np.eye(3), blank.K, (side, side), cv2.CV_32FC1)
+    v, u = np.mgrid[:side, :side].reshape(2, -1)
+    rays = np.column_stack([u, v, np.ones(side * side)]) @ np.linalg.inv(blank.K).T
+    x, y = camera.project(rays).astype(np.float32).T.reshape(2, side, side)  # by its own model, whichever it is
     rgb = cv2.remap(frame.rgb, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     depth = None
     if frame.depth is not None:

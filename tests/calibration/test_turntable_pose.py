@@ -1,23 +1,47 @@
 """The plate's pose is the camera's true one, its axis the true axis, and a picture that tells neither says why."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
-from calibration.boards import parse_board
+from calibration.boards import Board, parse_board
 from calibration.camera import Camera
 from calibration.turntable_pose import PlateNotFoundError, T_board_plate, locate_plate, plate_axis, turned
+from tests.calibration.boards import CAMERAS, poses
 from tests.perception.turning import BOARD, Turning
 
 SCENE = Turning(depth=False, block=False)
 
 
-def test_the_pose_is_where_the_camera_is() -> None:
+FISHEYE = replace(SCENE, distortion=(-0.02, 0.01, -0.004, 0.001), model="equidistant")
+
+
+@pytest.mark.parametrize("scene", [SCENE, FISHEYE], ids=["pinhole", "fisheye"])
+def test_the_pose_is_where_the_camera_is(scene: Turning) -> None:
     for angle in (0.0, 100.0):
-        found = locate_plate(BOARD, SCENE.camera, SCENE.frame(angle).rgb)
-        error = np.linalg.inv(SCENE.T_plate_camera(angle)) @ found.T_plate_camera
+        found = locate_plate(BOARD, scene.camera, scene.frame(angle).rgb)
+        error = np.linalg.inv(scene.T_plate_camera(angle)) @ found.T_plate_camera
         assert np.linalg.norm(error[:3, 3]) < 0.003 and np.trace(error[:3, :3]) > 1 + 2 * np.cos(np.deg2rad(0.5))
         assert found.corners > 15 and found.rms < 0.6
+
+
+@pytest.mark.parametrize("model", sorted(CAMERAS))
+def test_the_pose_of_noisy_corners_is_right_within_their_noise(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over many poses the errors are as large as least squares says: chi2 of 6 degrees of freedom has mean 6."""
+    camera, rng, noise, chi2 = CAMERAS[model], np.random.default_rng(0), 0.2, []
+    for T in poses(camera, BOARD, 40, 40.0, seed=1, away=(5, 12)):
+        px = camera.project(BOARD.corners @ T[:3, :3].T + T[:3, 3])
+        seen = BOARD.corners, px + noise * rng.standard_normal(px.shape)
+        monkeypatch.setattr(Board, "find", lambda self, rgb, seen=seen: seen)
+        found = locate_plate(BOARD, camera, np.zeros((480, 640, 3), np.uint8)).T_plate_camera
+        T_camera_board = np.linalg.inv(T_board_plate(BOARD) @ found)
+        turn, true = cv2.Rodrigues(T_camera_board[:3, :3])[0].ravel(), cv2.Rodrigues(T[:3, :3])[0].ravel()
+        off = np.concatenate([turn - true, T_camera_board[:3, 3] - T[:3, 3]])
+        J = camera.project_posed(BOARD.corners, true, T[:3, 3])[2]
+        chi2.append(off @ (J.T @ J / noise**2) @ off)
+    assert np.mean(chi2) == pytest.approx(6.0, abs=4 * np.sqrt(12 / 40))
 
 
 def test_the_plates_frame_is_as_it_says() -> None:

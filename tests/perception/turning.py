@@ -26,13 +26,14 @@ class Turning:
     block: bool = True
     noise: float = 2.0
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    model: str = "plumb_bob"
     light: float = 0.85
     hidden: frozenset[int] = frozenset()  # whole degrees at which a hand is before the camera
 
     @property
     def camera(self) -> Camera:
         K = np.array([[500.0, 0, 243.0], [0, 498.0, 176.0], [0, 0, 1]])
-        return Camera(480, 360, K, np.array(self.distortion))
+        return Camera(480, 360, K, np.array(self.distortion), self.model)
 
     def T_plate_camera(self, angle: float) -> np.ndarray:
         c, s = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))

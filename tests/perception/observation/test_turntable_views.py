@@ -29,10 +29,37 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / (a | b).sum())
 
 
-def test_a_square_shows_what_the_rays_of_the_frame_see() -> None:
+LENSES = {
+    "plumb_bob": np.array([-0.2, 0.05, 0.002, -0.001, 0.0]),
+    "rational_polynomial": np.array([0.4, 0.1, 1e-4, -6e-5, 0.02, 0.7, 0.2, 0.05]),
+    "equidistant": np.array([-0.02, 0.01, -0.004, 0.001]),
+}
+
+
+@pytest.mark.parametrize("model", sorted(LENSES))
+def test_a_known_point_is_where_the_square_says(model: str) -> None:
+    """Depth that is its pixel's place in the frame: a point that projects there is found there, within 0.1 px."""
+    camera = Camera(640, 480, np.array([[300.0, 0, 310.0], [0, 302.0, 233.0], [0, 0, 1]]), LENSES[model], model)
+    v, u = np.mgrid[:480, :640].astype(np.float32)
+    rgb = np.zeros((480, 640, 3), np.uint8)
+    columns, rows = (square(Frame(0, "c", rgb, place + 1, None, camera)).depth for place in (u, v))
+    view = square(Frame(0, "c", rgb, u, None, camera))
+    rng = np.random.default_rng(0)
+    at = rng.uniform(20, view.side - 20, (200, 2)).round()
+    rays = np.column_stack([at, np.ones(200)]) @ np.linalg.inv(view.K).T
+    px = camera.project(rays * rng.uniform(0.3, 2.0, (200, 1)))
+    x, y = at.astype(int).T
+    there = view.inside[y, x]
+    assert there.sum() > 100
+    found = np.column_stack([columns[y, x], rows[y, x]])[there] - 1  # whole pixels: depth is not interpolated
+    assert np.abs(found - px[there]).max() < 0.5 + 0.1
+
+
+@pytest.mark.parametrize("model", sorted(LENSES))
+def test_a_square_shows_what_the_rays_of_the_frame_see(model: str) -> None:
     """With a lens that bends: colour that is a function of direction is the same function in the square."""
     K = np.array([[150.0, 0, 84.0], [0, 152.0, 57.0], [0, 0, 1]])
-    camera = Camera(160, 120, K, np.array([-0.2, 0.05, 0.002, -0.001, 0.0]))
+    camera = Camera(160, 120, K, LENSES[model], model)
     v, u = np.mgrid[:120, :160]
     rays = camera.rays(np.column_stack([u.ravel(), v.ravel()]))
     colour = np.rint(127 + 120 * np.stack([rays[:, 0], rays[:, 1], rays[:, 0] - rays[:, 1]], -1)).astype(np.uint8)
