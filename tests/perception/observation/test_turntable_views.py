@@ -42,8 +42,8 @@ def test_a_known_point_is_where_the_square_says(model: str) -> None:
     camera = Camera(640, 480, np.array([[300.0, 0, 310.0], [0, 302.0, 233.0], [0, 0, 1]]), LENSES[model], model)
     v, u = np.mgrid[:480, :640].astype(np.float32)
     rgb = np.zeros((480, 640, 3), np.uint8)
-    columns, rows = (square(Frame(0, "c", rgb, place + 1, None, camera)).depth for place in (u, v))
-    view = square(Frame(0, "c", rgb, u, None, camera))
+    columns, rows = (square(Frame(rgb, place + 1, camera)).depth for place in (u, v))
+    view = square(Frame(rgb, u, camera))
     rng = np.random.default_rng(0)
     at = rng.uniform(20, view.side - 20, (200, 2)).round()
     rays = np.column_stack([at, np.ones(200)]) @ np.linalg.inv(view.K).T
