@@ -23,7 +23,8 @@ from benchmarks.measures.scores import Answer, shapes_at
 from benchmarks.rivals.quick import RivalConfig, encoder_alone, encoder_picture
 from benchmarks.scenes.vessels import VesselView
 from perception.inference.controller import ControllerConfig, estimate
-from perception.observation.rays import ObjectFrame, observe
+from perception.observation.object_frame import ObjectFrame
+from perception.observation.rays import observe
 from perception.observation.visibility import answered_voxels
 from probnerf.inference import crossings_of, infer, likelihood_of
 from probnerf.likelihood.dispatch import log_likelihood

@@ -14,7 +14,8 @@ from benchmarks.measures.scores import Answer, shapes_at
 from benchmarks.scenes.vessels import GRID, VesselView
 from perception.inference.controller import ControllerConfig, estimate
 from perception.observation.encoder_crop import crop
-from perception.observation.rays import ObjectFrame, observe
+from perception.observation.object_frame import ObjectFrame
+from perception.observation.rays import observe
 from perception.observation.segmentation import Segment
 from perception.observation.visibility import answered_voxels
 from perception.sources.frame import Frame

@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float
 from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
-from perception.observation.rays import ObjectFrame, ObserveConfig, object_frame
+from perception.observation.object_frame import ObjectFrame, object_frame
+from perception.observation.rays import ObserveConfig
 from perception.observation.segmentation import Segment, segment
 from perception.observation.visibility import seen_voxels
 from perception.observation.without_depth import PlaneGuess

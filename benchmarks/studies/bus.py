@@ -25,7 +25,7 @@ from node.ros.messages import QUERY_REGION, header, image_message, make
 from node.ros.parameters import serve_parameters
 from node.ros.services import POINTS, Answers
 from perception.answers.hypotheses import Hypotheses
-from perception.observation.rays import ObjectFrame
+from perception.observation.object_frame import ObjectFrame
 from probnerf.rendering.occupancy import voxel_centres
 
 _IMAGE = "sensor_msgs/msg/Image"

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from calibration.camera import Camera
 from perception.answers.hypotheses import Hypotheses
-from perception.observation.rays import ObjectFrame
+from perception.observation.object_frame import ObjectFrame
 from probnerf.geometry import look_at, pinhole_rays
 from probnerf.types import BASE_Z, FREE, OBJECT, UNKNOWN
 

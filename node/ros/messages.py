@@ -18,7 +18,7 @@ from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
 from perception.answers.hypotheses import Hypotheses
-from perception.observation.rays import ObjectFrame
+from perception.observation.object_frame import ObjectFrame
 from perception.sources.frame import Frame
 
 FOLDER = Path(__file__).resolve().parents[2] / "launch" / "farside_msgs"

@@ -14,7 +14,8 @@ from perception.answers.hypotheses import FrameName, Hypotheses, binary_entropy,
 from perception.answers.query import QueryResult, query
 from perception.answers.regions import Box, Points
 from perception.inference.tracker import TrackConfig
-from perception.observation.rays import ObserveConfig, object_frame
+from perception.observation.object_frame import object_frame
+from perception.observation.rays import ObserveConfig
 from perception.observation.segmentation import Segment, backproject, segment
 from perception.sources.frame import Frame
 from probnerf.rendering.occupancy import voxel_centres

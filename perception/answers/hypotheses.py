@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from scipy.special import entr
 from skimage.measure import marching_cubes
 
-from perception.observation.rays import ObjectFrame
+from perception.observation.object_frame import ObjectFrame
 from probnerf.geometry import rigid
 from probnerf.rendering.occupancy import solid, voxel_centres, voxel_index, voxel_surface
 from probnerf.types import BASE_Z

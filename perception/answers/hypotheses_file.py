@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.answers.hypotheses import Hypotheses
-from perception.observation.rays import ObjectFrame
+from perception.observation.object_frame import ObjectFrame
 
 FORMAT = "farside-hypotheses-"
 VERSION = 2  # 1: poses without z

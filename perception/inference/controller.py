@@ -24,7 +24,8 @@ from jaxtyping import Array
 from perception.answers.hypotheses import Hypotheses
 from perception.inference.publish import PublishConfig, View, published
 from perception.observation.encoder_crop import crop
-from perception.observation.rays import ObjectFrame, ObserveConfig, observe
+from perception.observation.object_frame import ObjectFrame
+from perception.observation.rays import ObserveConfig, observe
 from perception.observation.segmentation import Segment
 from perception.observation.visibility import seen_voxels
 from perception.sources.frame import Frame

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from perception.answers.hypotheses import Hypotheses
-from perception.observation.rays import ObjectFrame
+from perception.observation.object_frame import ObjectFrame
 from perception.observation.segmentation import Segment
 from perception.observation.visibility import answered_voxels
 from perception.sources.frame import Frame

@@ -18,7 +18,8 @@ from jaxtyping import Bool, Float
 from perception.answers.hypotheses import Hypotheses
 from perception.inference.controller import ControllerConfig, infer_view
 from perception.inference.publish import View
-from perception.observation.rays import ObjectFrame, object_frame, observe
+from perception.observation.object_frame import ObjectFrame, object_frame
+from perception.observation.rays import observe
 from perception.observation.segmentation import Segment
 from perception.observation.visibility import seen_voxels
 from perception.sources.frame import Frame

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from perception.observation.rays import ObjectFrame
+from perception.observation.object_frame import ObjectFrame
 from perception.observation.segmentation import Segment
 from perception.sources.frame import Frame
 from probnerf.geometry import look_at, pinhole_rays

@@ -1,26 +1,22 @@
-"""From a segment of a frame to what the model conditions on: the object's frame, and rays in its cube."""
+"""From a segment of a frame to what the model conditions on: rays in the object's cube."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
 
 from calibration.camera import Camera
-from perception.observation.segmentation import Segment, backproject
-from perception.observation.support_plane import heights
-from perception.observation.visible_extent import visible_body
-from perception.observation.without_depth import standing_body
+from perception.observation.object_frame import ObjectFrame, ObjectFrameConfig, object_frame
+from perception.observation.segmentation import Segment
 from perception.sources.frame import Frame
-from probnerf.types import BASE_Z, FREE, OBJECT, UNKNOWN, Observation, Rays, on_device
+from probnerf.types import FREE, OBJECT, UNKNOWN, Observation, Rays, on_device
 
-# The larger of a body's width and height is this many cube units: the scale convention of the prior.
-BODY_EXTENT = 1.4
 NO_LIMIT = 1e3  # cube units: a ray that misses the object without an end
 
 
 @dataclass(frozen=True)
-class ObserveConfig:
+class ObserveConfig(ObjectFrameConfig):
     """How a segment becomes an Observation. Ray counts are fixed, so that no frame compiles anew."""
 
     colour_rays: int = 32  # OBJECT pixels
@@ -30,48 +26,22 @@ class ObserveConfig:
     range_sigma_b: float = 2.0e-3  # 1/m
     cube: float = 1.2  # half side (cube units) of the box that a ray must meet to be worth asking
     outline_band: float = 0.25  # cube units either side of the mask that count as near its outline
-    xy_sigma: float = 0.08  # cube units; prior width of the body's axis about the guess
-    log_scale_sigma: float = 0.06
     range_offset_sigma: float = 0.005  # m; bias that all ranges of a view share
     plane_sigma: float = 0.005  # m; of the plane's height, which a sensor measures at a grazing angle
-    hidden_sigma: float = 0.3  # added to all widths, times the share of the outline that is hidden or cut off
-    side_sigma: float = 0.08  # added to all widths where the camera does not look down on the top
-    rim_reach: float = 0.02  # m; a rim pixel this near its neighbour inside the outline is of the object
-    outline_px: int = 5  # px from the outline within which something nearer hides what goes on
-    min_height: float = 0.02  # m; the tabletop's range of sizes
-    max_side: float = 0.40  # m
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectFrame:
-    """The cube that an object is inferred in. p_camera = T_camera_object @ (half_extent p_cube).
+class _WindowPixels:
+    """What each of the n pixels in the cube's window says, row by row."""
 
-    Axes: z up along the support plane's normal, x horizontal towards the camera, y = z cross x. The plane is
-    z = BASE_Z in the cube, and x = y = 0 is the guess of the body's axis.
-    """
-
-    T_camera_object: Float[np.ndarray, "4 4"]  # m
-    half_extent: float  # m per cube unit
-    plane: Float[np.ndarray, "4"]  # (n, d): n.p + d = 0 in the camera frame (m)
-    xy_sigma: float  # cube units; standard deviation of the axis about the guess
-    log_scale_sigma: float
-    along_sigma: float = 0.0  # cube units; of the axis towards the camera (x), on top of xy_sigma
-    sight_sigma: float = 0.0  # without depth: relative error of the distance, which place and size share (`monocular`)
-
-    def to_camera(self, points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
-        """Cube coordinates to the camera frame (m)."""
-        return points * self.half_extent @ self.T_camera_object[:3, :3].T + self.T_camera_object[:3, 3]
-
-    def seen_from(self, T_other_camera: Float[np.ndarray, "4 4"]) -> "ObjectFrame":
-        """The same cube in another camera's frame: p_other = T_other_camera @ p_camera."""
-        R, t = T_other_camera[:3, :3], T_other_camera[:3, 3]
-        normal = R @ self.plane[:3]
-        plane = np.append(normal, self.plane[3] - normal @ t)
-        return replace(self, T_camera_object=T_other_camera @ self.T_camera_object, plane=plane)
-
-    def to_cube(self, points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
-        """Camera frame (m) to cube coordinates."""
-        return (points - self.T_camera_object[:3, 3]) @ self.T_camera_object[:3, :3] / self.half_extent
+    pixels: Int[np.ndarray, "n 2"]  # u, v
+    direction: Float[np.ndarray, "n 3"]  # of its ray, along the cube's axes, unit
+    meets_cube: Bool[np.ndarray, "n"]
+    status: Int[np.ndarray, "n"]  # UNKNOWN, OBJECT or FREE
+    occluder: Bool[np.ndarray, "n"]  # it sees something nearer than the object
+    near_outline: Bool[np.ndarray, "n"]
+    rgb: UInt8[np.ndarray, "n 3"]
+    range_m: Float[np.ndarray, "n"]  # along the ray; NaN: not measured
 
 
 def observe(
@@ -91,76 +61,118 @@ def observe(
     """
     config = config or ObserveConfig()
     cube = cube or object_frame(frame, segment, config)
-    rng = np.random.default_rng(seed)
-    v, u = np.mgrid[: frame.camera.height, : frame.camera.width]
+    window = _window_pixels(frame, segment, cube, config)
+    chosen = _chosen_pixels(window, config, np.random.default_rng(seed))
+    return _observation(window, chosen, _pose_sigma(frame.camera, cube, config), cube, config), cube
+
+
+def _window_pixels(frame: Frame, segment: Segment, cube: ObjectFrame, config: ObserveConfig) -> _WindowPixels:
+    """The pixels of the window that the cube falls in, with status, colour and range."""
     window = _window(frame.camera, cube, config.cube)
-    pixels = np.stack([u[window].ravel(), v[window].ravel()], axis=-1)
-    flat = np.ravel_multi_index((pixels[:, 1], pixels[:, 0]), u.shape)
+    v, u = np.mgrid[window]
+    pixels = np.stack([u.ravel(), v.ravel()], axis=-1)
     rays = frame.camera.rays(pixels)
     directions = rays @ cube.T_camera_object[:3, :3]
-    origin = cube.to_cube(np.zeros(3))
-    usable = _meets_cube(origin, directions, config.cube)
-    status = segment.status.ravel()[flat]
-    depth = np.full(u.shape, np.nan) if frame.depth is None else frame.depth
-    metres = depth.ravel()[flat] / rays[:, 2]  # z-depth to range along the ray
-    sigma = config.range_sigma_a + config.range_sigma_b * metres**2
+    depth = np.full(segment.mask.shape, np.nan) if frame.depth is None else frame.depth
+    distance = np.linalg.norm(cube.T_camera_object[:3, 3])
+    band_px = config.outline_band * cube.half_extent * frame.camera.K[0, 0] / distance
+    return _WindowPixels(
+        pixels=pixels,
+        direction=directions,
+        meets_cube=_meets_cube(cube.to_cube(np.zeros(3)), directions, config.cube),
+        status=segment.status[window].ravel(),
+        occluder=segment.occluder[window].ravel(),
+        near_outline=_near_mask(segment.mask, window, band_px).ravel(),
+        rgb=frame.rgb[window].reshape(-1, 3),
+        range_m=depth[window].ravel() / rays[:, 2],  # z-depth to range along the ray
+    )
 
-    # Half of the free rays pass close to the object: they bound its outline.
-    focal = frame.camera.K[0, 0]
-    band = config.outline_band * cube.half_extent * focal / np.linalg.norm(cube.T_camera_object[:3, 3])
-    (box,) = ndimage.find_objects(segment.mask.astype(np.int8))
+
+def _near_mask(
+    mask: Bool[np.ndarray, "h w"], window: tuple[slice, slice], band_px: float
+) -> Bool[np.ndarray, "rows columns"]:
+    """Which pixels of the window lie in the mask or at most `band_px` from it."""
+    (box,) = ndimage.find_objects(mask.astype(np.int8))
     part = tuple(slice(min(a.start, b.start), max(a.stop, b.stop)) for a, b in zip(window, box, strict=True))
-    close = np.zeros_like(segment.mask)
-    close[part] = ndimage.distance_transform_edt(~segment.mask[part]) <= band
-    close = close.ravel()[flat]
-    free = usable & (status == FREE)
-    near = _spread(pixels, np.flatnonzero(free & close), config.free_rays // 2, rng)
-    rest = np.setdiff1d(np.flatnonzero(free), near)
+    near = np.zeros_like(mask)
+    near[part] = ndimage.distance_transform_edt(~mask[part]) <= band_px
+    return near[window]
+
+
+def _chosen_pixels(window: _WindowPixels, config: ObserveConfig, rng: np.random.Generator) -> Int[np.ndarray, "rays"]:
+    """Index of each ray's pixel, group by group: OBJECT, FREE, those that see an occluder; -1: padding.
+
+    Half of the free rays pass close to the object: they bound its outline.
+    """
+
+    def spread(candidates: Int[np.ndarray, "m"], count: int) -> Int[np.ndarray, "k"]:
+        return _spread(window.pixels, candidates, count, rng)
+
+    def padded(indices: Int[np.ndarray, "k"], count: int) -> Int[np.ndarray, "count"]:
+        return np.append(indices, np.full(count - len(indices), -1))
+
+    free = window.meets_cube & (window.status == FREE)
+    near = spread(np.flatnonzero(free & window.near_outline), config.free_rays // 2)
+    objects = spread(np.flatnonzero(window.meets_cube & (window.status == OBJECT)), config.colour_rays)
+    others = spread(np.setdiff1d(np.flatnonzero(free), near), config.free_rays - len(near))
+    occluders = spread(np.flatnonzero(window.meets_cube & window.occluder), config.occluder_rays)
     groups = [
-        (_spread(pixels, np.flatnonzero(usable & (status == OBJECT)), config.colour_rays, rng), config.colour_rays),
-        (np.append(near, _spread(pixels, rest, config.free_rays - len(near), rng)), config.free_rays),
-        (
-            _spread(pixels, np.flatnonzero(usable & segment.occluder.ravel()[flat]), config.occluder_rays, rng),
-            config.occluder_rays,
-        ),
+        padded(objects, config.colour_rays),
+        padded(np.append(near, others), config.free_rays),
+        padded(occluders, config.occluder_rays),
     ]
-    # Slots without a pixel look at the cube's centre and say nothing.
-    chosen = np.concatenate([np.append(i, np.full(count - len(i), -1)) for i, count in groups]).astype(np.intp)
+    return np.concatenate(groups).astype(np.intp)
+
+
+def _observation(
+    window: _WindowPixels,
+    chosen: Int[np.ndarray, "rays"],
+    pose_sigma: Float[np.ndarray, "5"],
+    cube: ObjectFrame,
+    config: ObserveConfig,
+) -> Observation:
+    """The chosen pixels as an Observation. Padding looks at the cube's centre and says nothing.
+
+    A range d has the standard deviation a + b d^2. A FREE ray is empty up to its measured end, an occluder's up to two
+    standard deviations before it.
+    """
     real = chosen >= 0
+    status = np.where(real, window.status[chosen], UNKNOWN)
+    measured = real & np.isfinite(window.range_m[chosen])
+    sigma = config.range_sigma_a + config.range_sigma_b * window.range_m[chosen] ** 2
+    range_m, sigma = np.nan_to_num(window.range_m[chosen]), np.nan_to_num(sigma, nan=config.range_sigma_a)
+    free_limit = np.where(measured, range_m / cube.half_extent, NO_LIMIT)
+    occluder_limit = np.where(measured, np.maximum(range_m - 2.0 * sigma, 0.0) / cube.half_extent, 0.0)
+    limit = np.select([status == FREE, status == UNKNOWN], [free_limit, occluder_limit], 0.0)
+    origin = cube.to_cube(np.zeros(3))
     towards = -origin / np.linalg.norm(origin)
-    kind = np.where(real, status[chosen], UNKNOWN)
-    measured = real & np.isfinite(metres[chosen])
-    metres, sigma = np.nan_to_num(metres[chosen]), np.nan_to_num(sigma[chosen], nan=config.range_sigma_a)
-    limit = np.where(kind == FREE, np.where(measured, metres / cube.half_extent, NO_LIMIT), 0.0)
-    occluded = (kind == UNKNOWN) & measured
-    limit = np.where(occluded, np.maximum(metres - 2.0 * sigma, 0.0) / cube.half_extent, limit)
-    observation = Observation(
+    return Observation(
         rays=Rays(
             origin=on_device(np.broadcast_to(origin, (len(chosen), 3))),
-            direction=on_device(np.where(real[:, None], directions[chosen], towards)),
+            direction=on_device(np.where(real[:, None], window.direction[chosen], towards)),
         ),
-        status=on_device(kind, np.int32),
-        rgb=on_device(np.where(real[:, None], frame.rgb.reshape(-1, 3)[flat[chosen]] / 255.0, 0.0)),
-        rgb_valid=on_device(kind == OBJECT, np.bool_),
-        range=on_device(np.where(kind == OBJECT, metres, 0.0) / cube.half_extent),
+        status=on_device(status, np.int32),
+        rgb=on_device(np.where(real[:, None], window.rgb[chosen] / 255.0, 0.0)),
+        rgb_valid=on_device(status == OBJECT, np.bool_),
+        range=on_device(np.where(status == OBJECT, range_m, 0.0) / cube.half_extent),
         range_sigma=on_device(sigma / cube.half_extent),
-        range_valid=on_device(measured & (kind == OBJECT), np.bool_),
+        range_valid=on_device(measured & (status == OBJECT), np.bool_),
         limit=on_device(limit),
-        pose_sigma=on_device(
-            np.hypot(
-                [
-                    cube.xy_sigma + cube.along_sigma,
-                    cube.xy_sigma,
-                    cube.log_scale_sigma,
-                    config.range_offset_sigma / cube.half_extent,
-                    config.plane_sigma / cube.half_extent,
-                ],
-                calibration_widths(frame.camera, cube),
-            )
-        ),
+        pose_sigma=on_device(pose_sigma),
         colour_count=config.colour_rays,
     )
-    return observation, cube
+
+
+def _pose_sigma(camera: Camera, cube: ObjectFrame, config: ObserveConfig) -> Float[np.ndarray, "5"]:
+    """Prior standard deviations of x, y, log-scale, range offset and z, in the order of `Observation.pose_sigma`."""
+    own = [
+        cube.xy_sigma + cube.along_sigma,
+        cube.xy_sigma,
+        cube.log_scale_sigma,
+        config.range_offset_sigma / cube.half_extent,
+        config.plane_sigma / cube.half_extent,
+    ]
+    return np.hypot(own, calibration_widths(camera, cube))
 
 
 def calibration_widths(camera: Camera, cube: ObjectFrame) -> Float[np.ndarray, "5"]:
@@ -184,88 +196,6 @@ def calibration_widths(camera: Camera, cube: ObjectFrame) -> Float[np.ndarray, "
     shift = np.hypot(s * at[:2], camera.K_std[:2, 2] * at[2] / focal) / cube.half_extent  # right, down
     sideways = float(np.sqrt((shift**2).mean()))
     return np.array([sideways, sideways, s, s * np.linalg.norm(at) / cube.half_extent, 0.0])
-
-
-def object_frame(frame: Frame, segment: Segment, config: ObserveConfig) -> ObjectFrame:
-    """The cube about a segment's object: from its visible points or, without depth, from its outline.
-
-    Raises `ValueError` where they are too few, or the object's size is out of range.
-    """
-    # Where the outline borders on something nearer, or on the picture's edge, the object goes on unseen.
-    width = config.outline_px
-    hidden = ndimage.binary_dilation(np.pad(segment.occluder, width, constant_values=True), iterations=width)
-    hidden = hidden[width:-width, width:-width]
-    outline = segment.mask & ~ndimage.binary_erosion(segment.mask, border_value=0)
-    extra = config.hidden_sigma * float((hidden & outline).sum() / outline.sum())
-    if frame.depth is None:
-        return _outlined_frame(frame.camera, segment, hidden, extra, config)
-    (box,) = ndimage.find_objects(segment.mask.astype(np.int8))  # all of the object is in it
-    points, mask, hidden = backproject(frame)[box], segment.mask[box], hidden[box]
-    core = (segment.status[box] == OBJECT) & np.isfinite(points[..., 2])
-    if core.sum() < 10:
-        raise ValueError(
-            f"object {segment.id} has depth in {core.sum()} pixels inside its outline; move the camera "
-            "nearer, and see that depth is aligned to colour"
-        )
-    # The rim counts here, where its depth continues the object's: it is wide on surfaces seen at a grazing angle.
-    row, column = ndimage.distance_transform_edt(~core, return_distances=False, return_indices=True)
-    with np.errstate(invalid="ignore"):
-        core |= mask & (np.linalg.norm(points - points[row, column], axis=-1) < config.rim_reach)
-    core &= heights(points, segment.plane) > 0.0
-    thin = max(1, core.sum() // 10_000)
-    cloud = points[core][::thin]
-    up, d = segment.plane[:3], segment.plane[3]
-    axes = _axes(up, np.median(cloud, axis=0))
-    seen = np.column_stack([cloud @ axes[:2].T, heights(cloud, segment.plane)])
-    centre, across, height, top_seen = visible_body(seen, hidden[core][::thin], float(d))
-    foot = centre @ axes[:2] - d * up  # on the plane, where n.p = -d
-    extra += 0.0 if top_seen else config.side_sigma
-    return _frame_about(foot, across, height, segment, extra, config)
-
-
-def _outlined_frame(
-    camera: Camera, segment: Segment, hidden: Bool[np.ndarray, "h w"], extra: float, config: ObserveConfig
-) -> ObjectFrame:
-    """The cube about an object without depth; place and size have the error of the supposed plane, too."""
-    try:
-        body = standing_body(camera, segment.mask, hidden, segment.plane, segment.plane_sigma or (0.0, 0.0))
-    except ValueError as error:
-        raise ValueError(f"object {segment.id}: {error}") from None
-    height = max(body.height, config.min_height)  # of a low box that is taken for a round thing, nothing is left
-    cube = _frame_about(body.foot, body.across, height, segment, extra, config)
-    return replace(
-        cube,
-        xy_sigma=cube.xy_sigma + body.across_sigma,
-        log_scale_sigma=cube.log_scale_sigma + body.log_scale_sigma,
-        along_sigma=body.along_sigma,
-        sight_sigma=body.sight_sigma,
-    )
-
-
-def _frame_about(
-    foot: Float[np.ndarray, "3"], across: float, height: float, segment: Segment, extra: float, config: ObserveConfig
-) -> ObjectFrame:
-    """The cube of a body that stands at `foot` (camera frame, m), `extra` added to its widths."""
-    if height < config.min_height or max(across, height) > config.max_side:
-        raise ValueError(
-            f"object {segment.id} measures {100 * across:.1f} cm across and {100 * height:.1f} cm in height; tabletop"
-            f" objects are {100 * config.min_height:g} cm high to {100 * config.max_side:g} cm: give another object"
-        )
-    half_extent = max(across, height) / BODY_EXTENT
-    up = segment.plane[:3]
-    T = np.eye(4)
-    T[:3, :3] = _axes(up, foot).T
-    T[:3, 3] = foot - BASE_Z * half_extent * up
-    return ObjectFrame(T, half_extent, segment.plane, config.xy_sigma + extra, config.log_scale_sigma + extra)
-
-
-def _axes(up: Float[np.ndarray, "3"], at: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Rows x, y, z of an object frame at a point of the camera frame: x horizontal towards the camera."""
-    x = -at - (-at @ up) * up
-    if np.linalg.norm(x) < 1e-3 * np.linalg.norm(at):  # straight from above: towards the picture's lower edge
-        x = np.array([0.0, 1.0, 0.0]) - up[1] * up
-    x = x / np.linalg.norm(x)
-    return np.stack([x, np.cross(up, x), up])
 
 
 def _window(camera: Camera, cube: ObjectFrame, half: float) -> tuple[slice, slice]:

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from calibration.camera import Camera
-from perception.observation.rays import ObjectFrame
+from perception.observation.object_frame import ObjectFrame
 from perception.observation.segmentation import Segment
 from perception.observation.without_depth import plane_depth
 from perception.sources.frame import Frame

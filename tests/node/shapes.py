@@ -5,7 +5,7 @@ import socket
 import numpy as np
 
 from perception.answers.hypotheses import Hypotheses
-from perception.observation.rays import ObjectFrame
+from perception.observation.object_frame import ObjectFrame
 from probnerf.rendering.occupancy import voxel_centres
 
 GRID, HALF_EXTENT = 32, 0.16

@@ -13,7 +13,8 @@ from benchmarks.scenes.vessels import ViewConfig, simulated_camera
 from perception.answers.query import query
 from perception.answers.regions import Box
 from perception.inference.controller import ControllerConfig, Estimate, estimate
-from perception.observation.rays import BODY_EXTENT, ObserveConfig
+from perception.observation.object_frame import BODY_EXTENT
+from perception.observation.rays import ObserveConfig
 from perception.observation.segmentation import segment
 from perception.simulation.sensor_faults import sense
 from perception.simulation.simulated_camera import place_camera

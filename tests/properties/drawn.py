@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
 from perception.answers.hypotheses import Hypotheses
-from perception.observation.rays import ObjectFrame
+from perception.observation.object_frame import ObjectFrame
 from perception.sources.frame import Frame
 
 Any_ = TypeVar("Any_")

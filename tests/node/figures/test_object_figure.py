@@ -11,7 +11,7 @@ from node.figures import voxel_renderer
 from node.figures.object_figure import draw_object, draw_training, representatives
 from node.figures.summary import figures, hidden_volume, warnings
 from perception.answers.hypotheses import Hypotheses
-from perception.observation.rays import ObjectFrame
+from perception.observation.object_frame import ObjectFrame
 from perception.observation.segmentation import segment
 from perception.sources.frame import Frame
 from probnerf.rendering.occupancy import voxel_centres

@@ -11,7 +11,7 @@ import pytest
 
 from perception.answers.hypotheses import Hypotheses, binary_entropy, by_weight, meshes, surface_points
 from perception.answers.hypotheses_file import hypotheses_path, load, load_scene, save
-from perception.observation.rays import ObjectFrame
+from perception.observation.object_frame import ObjectFrame
 from probnerf.rendering.occupancy import voxel_centres
 from probnerf.types import BASE_Z
 

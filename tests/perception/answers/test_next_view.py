@@ -8,7 +8,7 @@ import pytest
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.next_view import _words as words_of
 from perception.answers.next_view import first_hits, rank_views, ring_of_views
-from perception.observation.rays import ObjectFrame
+from perception.observation.object_frame import ObjectFrame
 from probnerf.geometry import look_at
 from probnerf.rendering.occupancy import voxel_centres
 

@@ -9,7 +9,7 @@ from perception.answers.hypotheses import Hypotheses
 from perception.answers.query import CAUTION, query
 from perception.answers.regions import Box, Points, Swept
 from perception.answers.xyz import read_points
-from perception.observation.rays import ObjectFrame
+from perception.observation.object_frame import ObjectFrame
 from probnerf.rendering.occupancy import voxel_centres
 
 GRID, HALF_EXTENT = 32, 0.16

@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 
 from perception.inference.controller import ControllerConfig, estimate
-from perception.observation.rays import (
-    BODY_EXTENT,
-    ObjectFrame,
-    ObserveConfig,
-    calibration_widths,
-    object_frame,
-    observe,
-)
+from perception.observation.object_frame import BODY_EXTENT, ObjectFrame, object_frame
+from perception.observation.rays import ObserveConfig, calibration_widths, observe
 from perception.observation.segmentation import Segment, segment
 from perception.observation.visibility import inside_view, seen_voxels
 from perception.sources.frame import Frame

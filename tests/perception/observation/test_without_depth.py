@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from calibration.camera import Camera
-from perception.observation.rays import ObserveConfig, object_frame
+from perception.observation.object_frame import object_frame
+from perception.observation.rays import ObserveConfig
 from perception.observation.segmentation import SegmentConfig, segment
 from perception.observation.without_depth import PlaneGuess, StandingBody, plane_depth, standing_body, supposed_plane
 from perception.simulation.simulated_camera import Placed, Scene, place_camera, render
