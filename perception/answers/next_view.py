@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt64
 
 from perception.answers.hypotheses import Hypotheses
+from perception.answers.query import check_one_frame
 from probnerf.geometry import look_at, pinhole_rays, rigid
 from probnerf.rendering.occupancy import voxel_index
 
@@ -54,17 +55,23 @@ def rank_views(
 ) -> RankedViews:
     """The `count` best of `cameras` (T_object_camera in the first object's frame, metres; None: `ring_of_views`).
 
-    Raises ValueError for an empty scene, or cameras that are no rigid transforms.
+    Raises ValueError for an empty scene, objects of different frames, cameras that are no rigid transforms, and a
+    camera at the centre of an object's cube.
     """
     config = config or NextViewConfig()
-    if not scene:
-        raise ValueError("the scene holds no objects; give at least one object's hypotheses")
+    check_one_frame(scene)
     first = scene[0]
     T = ring_of_views(first, config) if cameras is None else np.asarray(cameras, np.float64)
     _check_rigid(T)
     gain, entropy = np.zeros(len(T)), 0.0
     for h in scene:
         T_own = np.linalg.inv(h.object_frame.T_camera_object) @ first.object_frame.T_camera_object @ T
+        distance = np.linalg.norm(T_own[:, :3, 3], axis=1)
+        if (inside := distance < 1e-3 * h.object_frame.half_extent).any():
+            row = int(np.flatnonzero(inside)[0])
+            raise ValueError(
+                f"candidate camera {row + 1} is at the centre of object {h.object_id}; give one outside it"
+            )
         gain += _gains(h, T_own, config)
         w = np.bincount(h.twins, weights=h.weights)
         entropy -= float(np.sum(w[w > 0] * np.log(w[w > 0])))

@@ -56,7 +56,11 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
     Raises ValueError for an empty scene, objects of different frames, a frame that is unknown, or not recorded
     ("world"), or ambiguous ("object" with several objects).
     """
-    _check_scene(scene, frame)
+    check_one_frame(scene)
+    if frame == "object" and len(scene) > 1:
+        raise ValueError(
+            f"the object frame is ambiguous with {len(scene)} objects: ask in the frame camera or world, or one object"
+        )
     touched = []  # objects that have voxels in the region
     p_free, p_free_se, p_free_few, volumes, entropies = [], [], [], [], []
     blocked_by: dict[int, list[int]] = {}
@@ -99,13 +103,10 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
     )
 
 
-def _check_scene(scene: Sequence[Hypotheses], frame: FrameName) -> None:
+def check_one_frame(scene: Sequence[Hypotheses]) -> None:
+    """Raises ValueError for an empty scene, and for objects that were seen in different frames."""
     if not scene:
         raise ValueError("the scene holds no objects; give at least one object's hypotheses")
-    if frame == "object" and len(scene) > 1:
-        raise ValueError(
-            f"the object frame is ambiguous with {len(scene)} objects: ask in the frame camera or world, or one object"
-        )
     first = scene[0]
     for h in scene[1:]:
         if (h.stamp_ns, h.frame_id) != (first.stamp_ns, first.frame_id):

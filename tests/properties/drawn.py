@@ -74,6 +74,20 @@ def poses(draw: st.DrawFn) -> np.ndarray:
     return T
 
 
+@st.composite
+def scenes(draw: st.DrawFn) -> list[Hypotheses]:
+    """One or two objects of one frame; the origins of their cubes lie 0.01 to 0.25 m from the camera."""
+    stamp, place = draw(stamps), draw(poses())
+    objects = []
+    for i in range(draw(st.integers(1, 2))):
+        T = draw(poses())
+        T[:3, 3] = 0.02 * T[:3, 3] + [0.0, 0.0, 0.11]
+        cube = every_field(ObjectFrame, T_camera_object=st.just(T), half_extent=st.floats(0.05, 0.2), plane=vectors(4))
+        same = {"stamp_ns": st.just(stamp), "frame_id": st.just("camera"), "T_world_camera": st.just(place)}
+        objects.append(draw(hypotheses(object_id=st.just(i + 1), object_frame=cube, **same)))
+    return objects
+
+
 def vectors(size: int, most: float = 10.0) -> st.SearchStrategy[np.ndarray]:
     """f64[size] of finite numbers."""
     return st.lists(st.floats(-most, most), min_size=size, max_size=size).map(np.array)
@@ -90,11 +104,11 @@ def _shapes(draw: st.DrawFn) -> dict[str, Any]:
     count, grid = draw(st.integers(1, 5)), draw(st.sampled_from([4, 8]))
     rng = np.random.default_rng(draw(seeds))
     filled = rng.random((count, grid, grid, grid)) < rng.uniform(0.0, 0.3)
-    filled = filled[np.sort(rng.integers(0, count, count))]
+    alike = np.sort(rng.integers(0, count, count))
     weights = rng.dirichlet(np.full(count, 2.0))
     return {
-        "opacity": np.where(filled, rng.integers(128, 256), rng.integers(0, 128)).astype(np.uint8),
-        "pose": rng.normal(0.0, 0.1, (count, 5)).astype(np.float32),
+        "opacity": np.where(filled, rng.integers(128, 256), rng.integers(0, 128)).astype(np.uint8)[alike],
+        "pose": rng.normal(0.0, 0.1, (count, 5)).astype(np.float32)[alike],
         "weights": weights / weights.sum(),
         "population": rng.integers(0, 3, count).astype(np.int32),
         "seen": rng.random((grid, grid, grid)) < 0.5,

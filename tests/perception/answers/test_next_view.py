@@ -115,7 +115,12 @@ def test_the_ring_looks_at_the_object_from_the_present_distance() -> None:
 
 @pytest.mark.parametrize(
     ("cameras", "said"),
-    [(np.eye(4), "shape"), (np.full((1, 4, 4), np.nan), "rigid"), (2 * np.eye(4)[None], "rigid")],
+    [
+        (np.eye(4), "shape"),
+        (np.full((1, 4, 4), np.nan), "rigid"),
+        (2 * np.eye(4)[None], "rigid"),
+        (np.eye(4)[None], "candidate camera 1 is at the centre of object 1"),
+    ],
 )
 def test_a_camera_that_is_none_is_refused(cameras: np.ndarray, said: str) -> None:
     with pytest.raises(ValueError, match=said):
@@ -125,3 +130,8 @@ def test_a_camera_that_is_none_is_refused(cameras: np.ndarray, said: str) -> Non
 def test_an_empty_scene_is_refused() -> None:
     with pytest.raises(ValueError, match="no objects"):
         rank_views([])
+
+
+def test_objects_of_different_frames_are_refused() -> None:
+    with pytest.raises(ValueError, match="objects 1 and 2 are from different frames"):
+        rank_views([HIDDEN, replace(HIDDEN, object_id=2, stamp_ns=5)])
