@@ -102,6 +102,18 @@ def test_answers_are_probabilities_shares_and_ordered_volumes(scene: list[Hypoth
             assert r.p_free <= 1.0 - max(r.p_occupied) + ROUNDING
 
 
+@law
+@given(scenes(), seeds)
+def test_objects_are_independent(scene: list[Hypotheses], seed: int) -> None:
+    for region in regions(scene, seed):
+        together, alone = query(scene, region, "camera", NOW), [query([h], region, "camera", NOW) for h in scene]
+        assert together.p_free == pytest.approx(np.prod([r.p_free for r in alone]))
+        assert together.blocked_by == {name: rows for r in alone for name, rows in r.blocked_by.items()}
+        if together.p_occupied is not None:
+            free = np.prod([1.0 - np.array(r.p_occupied) for r in alone], axis=0)
+            np.testing.assert_allclose(1.0 - np.array(together.p_occupied), free, atol=ROUNDING)
+
+
 def same_answers(
     scene: list[Hypotheses], told: list[Hypotheses], region: Region, leave: tuple[str, ...] = ("blocked_by",)
 ) -> tuple[QueryResult, QueryResult]:
