@@ -46,6 +46,10 @@ class Replay:
         Path | None, arg(metavar="FILE.yaml", help_behavior_hint="(default: the intrinsics in the source)")
     ] = None
     """Calibration of the colour image (as `farside calibrate` writes it) to use in place of the recorded intrinsics."""
+    colour_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
+    """Colour image of a recording that has several."""
+    depth_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
+    """Depth image of a recording; needed where its name does not say depth, or its frame_id is not colour's."""
     prior: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the shipped tabletop prior)")] = (
         None
     )
@@ -70,6 +74,10 @@ class Live:
         Path | None, arg(metavar="FILE.yaml", help_behavior_hint="(default: the source's own intrinsics)")
     ] = None
     """Calibration of the colour image, as `farside calibrate` writes it."""
+    colour_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
+    """As of `farside replay`, of a recording."""
+    depth_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
+    """As of `farside replay`, of a recording."""
     record: Annotated[Path | None, arg(metavar="FILE.mcap", help_behavior_hint="(default: no recording)")] = None
     """Record every frame, the hypotheses and their schedule to a new file; `farside replay --schedule` repeats it."""
     page: Annotated[int | None, arg(metavar="PORT", help_behavior_hint="(default: no page)")] = None
@@ -104,6 +112,10 @@ class Record:
     """Where the source is a recording: leave out frames before this time after its first one."""
     end_s: Annotated[float | None, arg(name="to", metavar="SECONDS", help_behavior_hint="(default: the end)")] = None
     """Where the source is a recording: leave out frames after this time after its first one."""
+    colour_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
+    """As of `farside replay`, of a recording."""
+    depth_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
+    """As of `farside replay`, of a recording."""
     colour: Literal["raw", "png", "jpeg"] = "raw"
     """raw costs the least time, png (as exact) more of it and less space, jpeg the least space but is not exact."""
     depth: Literal["exact", "millimetres"] = "exact"

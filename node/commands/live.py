@@ -36,6 +36,7 @@ from perception.sources.playback import Playback
 from perception.sources.reader import Listener, Reader
 from perception.sources.recorder import RecordConfig, Recorder
 from perception.sources.recording import Log
+from perception.sources.topics import TopicNames
 from probnerf.prior.checkpoint import load_prior
 
 HYPOTHESES_TOPIC = "/farside/hypotheses"
@@ -50,6 +51,8 @@ class LiveConfig:
 
     source: str = "oak"  # oak, oak:ID, webcam:N, topic (a camera driver on the bus), a recording, a video, ...
     camera: Path | None = None  # calibration of the colour image
+    colour_topic: str | None = None  # of a recording; None: found by type and name
+    depth_topic: str | None = None  # of a recording; taken as aligned to colour
     record: Path | None = None  # new MCAP file
     budget: float = 40.0  # s of sampling for each object of a frame; what has not converged goes on with the next
     pace: float = 1.0  # of a recording
@@ -129,7 +132,8 @@ def live(config: LiveConfig, out: Console, err: Console) -> None:
 def _open(config: LiveConfig, bus: Bus) -> Source:
     if config.source == "topic":
         return TopicSource(bus, config.topic)
-    source = open_source(config.source, None if config.camera is None else read_camera(config.camera))
+    camera = None if config.camera is None else read_camera(config.camera)
+    source = open_source(config.source, camera, TopicNames(config.colour_topic, config.depth_topic))
     return Playback(source, config.pace) if isinstance(source, Log) else source
 
 

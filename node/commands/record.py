@@ -5,6 +5,7 @@ from rich.console import Console
 from node.options import Record
 from perception.sources.playback import open_playback
 from perception.sources.recorder import RecordConfig, Recorder
+from perception.sources.topics import TopicNames
 
 
 def record(options: Record, out: Console, err: Console) -> None:
@@ -15,7 +16,8 @@ def record(options: Record, out: Console, err: Console) -> None:
     """
     if options.seconds is not None and not options.seconds > 0:
         raise ValueError(f"--seconds is {options.seconds:g}; give more than 0")
-    source = open_playback(options.source, 0.0, options.start_s, options.end_s)
+    topics = TopicNames(options.colour_topic, options.depth_topic)
+    source = open_playback(options.source, 0.0, options.start_s, options.end_s, topics=topics)
     config = RecordConfig(colour=options.colour, depth=options.depth, compression=options.compression)
     recorder = Recorder(options.out, config, wait=not source.live)
     first_ns = last_ns = None

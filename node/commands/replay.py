@@ -24,6 +24,7 @@ from perception.sources.frame import Frame
 from perception.sources.frame_folder import write_frame_folder
 from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.playback import open_playback
+from perception.sources.topics import TopicNames
 from probnerf.inference import Method
 from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.sampling.hmc import StageInfo
@@ -48,6 +49,8 @@ class ReplayConfig:
     end_s: float | None = None
     schedule: bool = False  # repeat the inferences that the recording tells of
     camera: Path | None = None  # calibration in place of the source's intrinsics
+    colour_topic: str | None = None  # of a recording; None: found by type and name
+    depth_topic: str | None = None  # of a recording; taken as aligned to colour
     prior: Path | None = None  # None: the one that ships with the project
     colour_only: bool = False  # leave depth out
     box: tuple[int, int, int, int] | None = None  # px, of a frame without depth; wins over segment.mask
@@ -71,6 +74,11 @@ class ReplayConfig:
         return replace(self.controller, infer=replace(self.controller.infer, method=self.method))
 
     @property
+    def topics(self) -> TopicNames:
+        """The recording's topics that were asked for."""
+        return TopicNames(self.colour_topic, self.depth_topic)
+
+    @property
     def folder(self) -> Path:
         """Where the results go."""
         source = self.source or SHIPPED_LOG
@@ -88,7 +96,7 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
         raise ValueError(f"{config.folder} is a file; give a folder for the results with --out")
     prior = load_prior(config.prior)
     camera = None if config.camera is None else read_camera(config.camera)
-    frame = read_frame(config.source, config.frame, err, config.start_s, config.end_s, camera)
+    frame = read_frame(config.source, config.frame, err, config.start_s, config.end_s, camera, config.topics)
     if config.colour_only:
         frame = replace(frame, depth=None)
     segmentation, source = _segmentation(frame, config), config.source or SHIPPED_LOG
@@ -145,12 +153,13 @@ def read_frame(
     start_s: float = 0.0,
     end_s: float | None = None,
     camera: Camera | None = None,
+    topics: TopicNames | None = None,
 ) -> Frame:
-    """Frame `index` (-1: the last) of a source, or of a recording's range, with `camera` in place of its own.
+    """Frame `index` (-1: the last) of a source, or of a recording's range, with `camera` and `topics` for its own.
 
     Its notes go to `err`. Raises ValueError where there is none.
     """
-    opened = open_playback(source, start_s=start_s, end_s=end_s, camera=camera)
+    opened = open_playback(source, start_s=start_s, end_s=end_s, camera=camera, topics=topics)
     frame, count = None, 0
     for count, frame in enumerate(opened, start=1):  # noqa: B007
         if count == index + 1:

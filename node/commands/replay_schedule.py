@@ -26,7 +26,7 @@ def follow(config: ReplayConfig, out: Console, err: Console) -> bool:
     """
     path = config.source or SHIPPED_LOG
     camera = None if config.camera is None else read_camera(config.camera)
-    playback = open_playback(config.source, 0.0, config.start_s, config.end_s, camera)
+    playback = open_playback(config.source, 0.0, config.start_s, config.end_s, camera, config.topics)
     entries = playback.log.schedule() if isinstance(playback, Playback) else []
     entries = [entry for entry in entries if config.object in (None, entry.object_id)]
     if not entries:

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from calibration.camera import Camera
 from node.ros.bus import Bus
 from perception.sources.frame import Frame
 from perception.sources.ros_images import stamp_ns, to_camera, to_depth, to_rgb
 from perception.sources.stamp_matcher import Match, StampMatcher
+from perception.sources.topics import doubt, frame_of, is_rectified, named_otherwise, not_aligned, other_camera
 
 _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 
@@ -22,7 +22,9 @@ class TopicConfig:
     colour: str = "/camera/color/image_raw"
     depth: str | None = "/camera/aligned_depth_to_color/image_raw"  # aligned to colour; None: frames without depth
     info: str = "/camera/color/camera_info"
-    rectified: bool = False  # the images are: the camera is that of the info's P, without distortion
+    rectified: bool | None = None  # the images are: the camera is that of the info's P, without distortion; None: as
+    # the colour topic's name says, by a part rect or rectified
+    aligned: bool = False  # depth is aligned to colour though its frame_id is another
     tolerance_ms: float = 10.0  # between the stamps of colour and depth
     silence_s: float = 2.0  # without a frame, after which a note says so
     end_s: float | None = None  # without a frame, after which the source ends; None: never
@@ -31,20 +33,23 @@ class TopicConfig:
     def __post_init__(self) -> None:
         if not (self.tolerance_ms >= 0 and self.silence_s > 0 and self.waiting >= 1):
             raise ValueError("tolerance_ms must not be negative, silence_s be positive, and waiting be 1 or more")
+        if self.depth is not None and (word := named_otherwise(self.depth)):
+            raise ValueError(f"topic: depth is {self.depth}, whose name says {word}; give the camera's depth image")
 
 
 class TopicSource:
     """A live source: iterate over it for the newest frames; those that come while a frame is worked on are left out.
 
-    `notes` says what was missing or wrong, once a kind; `dropped` counts the colour images that found no depth,
-    `skipped` the frames that came too fast. It listens until `bus` ends; `close` ends an iteration.
+    `notes` says what was missing or wrong, once a kind and how often; `dropped` counts the colour images that found no
+    depth and are left out, `skipped` the frames that came too fast. It listens until `bus` ends; `close` ends an
+    iteration.
     """
 
     live = True
 
     def __init__(self, bus: Bus, config: TopicConfig | None = None) -> None:
         self.config = c = config or TopicConfig()
-        self.notes: list[str] = []
+        self._notes: dict[str, tuple[str, int]] = {}  # by kind: the last one, and how many
         self.dropped = self.skipped = 0
         self._changed = threading.Condition()
         streams = () if c.depth is None else (c.depth,)
@@ -53,6 +58,7 @@ class TopicSource:
         )
         self._matched: tuple[Any, Any] | None = None  # the newest colour and its depth, until there is an info
         self._info: Any = None
+        self._by_arrival = False  # some stream has no stamps
         self._heard: set[str] = set()  # topics on which something came since the last frame
         self._newest: Frame | None = None
         self._closed = False
@@ -62,6 +68,12 @@ class TopicSource:
         if c.depth is not None:
             packed = c.depth.endswith("/compressed") or c.depth.endswith("/compressedDepth")
             self._names.append(bus.subscribe(c.depth, _COMPRESSED if packed else _IMAGE, self._take_depth, depth=3))
+
+    @property
+    def notes(self) -> list[str]:
+        """What was missing or wrong until now."""
+        with self._changed:
+            return [text + (f" ({count} times)" if count > 1 else "") for text, count in self._notes.values()]
 
     def close(self) -> None:
         """End the iteration, from any thread."""
@@ -85,7 +97,7 @@ class TopicSource:
                 return
             elif now - noted > self.config.silence_s:
                 noted = float("inf")  # said once, until a frame comes
-                self._note(self._why_silent(now - heard))
+                self._note("silent", self._why_silent(now - heard))
 
     def _why_silent(self, seconds: float) -> str:
         with self._changed:
@@ -102,8 +114,10 @@ class TopicSource:
 
     def _take_colour(self, message: Any) -> None:
         with self._changed:
-            self._heard.add(self.config.colour)
-            self._settle(self._matcher.push_lead(stamp_ns(message), message))
+            c = self.config
+            self._heard.add(c.colour)
+            stamp = self._stamp(c.colour, message)
+            self._settle(self._matcher.push_lead(stamp, (stamp, message)))
         self._make_frame()
 
     def _take_depth(self, message: Any) -> None:
@@ -111,7 +125,7 @@ class TopicSource:
         assert depth is not None
         with self._changed:
             self._heard.add(depth)
-            self._settle(self._matcher.push_partner(depth, stamp_ns(message), message))
+            self._settle(self._matcher.push_partner(depth, self._stamp(depth, message), message))
         self._make_frame()
 
     def _settle(self, matches: list[Match[Any, Any]]) -> None:
@@ -126,8 +140,9 @@ class TopicSource:
             self.dropped += 1
             if (gap := match.gaps_ns[depth]) < float("inf"):
                 self._note(
+                    "dropped",
                     f"colour images are dropped for want of depth within {self.config.tolerance_ms:g} ms (the nearest"
-                    f" was {gap / 1e6:.1f} ms away); synchronise the streams, or raise tolerance_ms"
+                    f" was {gap / 1e6:.1f} ms away); synchronise the streams, or raise tolerance_ms",
                 )
 
     def _make_frame(self) -> None:
@@ -135,12 +150,12 @@ class TopicSource:
         with self._changed:
             if self._info is None or self._matched is None:
                 return
-            (colour, depth), self._matched = self._matched, None
+            ((stamp, colour), depth), self._matched = self._matched, None
             info = self._info
         try:
-            frame = self._frame(colour, depth, to_camera(info, self.config.rectified))
+            frame = self._frame(stamp, colour, depth, info)
         except ValueError as error:
-            self._note(f"frames are left out: {error}")
+            self._note("left out", f"frames are left out: {error}")
             raise ValueError(f"a frame is left out: {error}") from None  # the bus counts it
         with self._changed:
             self._heard.clear()
@@ -149,11 +164,33 @@ class TopicSource:
                 self._newest = frame
             self._changed.notify_all()
 
-    def _frame(self, colour: Any, depth: Any, camera: Camera) -> Frame:
-        rgb = to_rgb(colour)
-        metres = None if depth is None else to_depth(depth)
-        return Frame(rgb, metres, camera, stamp_ns=stamp_ns(colour), frame_id=colour.header.frame_id)
+    def _frame(self, stamp: int, colour: Any, depth: Any, info: Any) -> Frame:
+        c = self.config
+        if why := other_camera(info, colour):
+            raise ValueError(f"camera_info on {c.info} {why} ({c.colour}); give the camera_info of that camera as info")
+        camera = to_camera(info, is_rectified(c.colour) if c.rectified is None else c.rectified)
+        metres = None
+        if depth is not None:
+            if not c.aligned and (why := not_aligned(depth, colour)):
+                raise ValueError(f"depth on {c.depth} {why} to {c.colour}; give the aligned one, or say aligned: true")
+            metres = to_depth(depth)
+            if why := doubt(metres):
+                raise ValueError(f"{c.depth} is no depth: {why}; give the camera's depth image, in m (32FC1) or mm")
+        return Frame(to_rgb(colour), metres, camera, stamp_ns=stamp, frame_id=frame_of(colour))
 
-    def _note(self, text: str) -> None:
-        if text.partition(":")[0] not in {note.partition(":")[0] for note in self.notes}:
-            self.notes.append(text)
+    def _stamp(self, topic: str, message: Any) -> int:
+        """The stamp of an image (ns), or the time of its arrival once any came without. The lock is held."""
+        stamp = stamp_ns(message)
+        if not stamp:
+            self._by_arrival = True
+            self._note(
+                f"unstamped {topic}",
+                f"stamps on {topic} are empty; all images have the time of their arrival, by which they may be paired"
+                " wrongly: set header.stamp in the driver",
+            )
+        return time.time_ns() if self._by_arrival else stamp
+
+    def _note(self, kind: str, text: str) -> None:
+        """Keep the newest text of a kind, and count."""
+        with self._changed:
+            self._notes[kind] = text, self._notes.get(kind, ("", 0))[1] + 1

@@ -9,6 +9,8 @@ from jaxtyping import Float, Float32, Int32, Shaped, UInt8
 
 from calibration.camera import Camera
 
+SATURATED = 65535  # depth count of 16 bits
+
 
 @dataclass(frozen=True, eq=False, init=False)
 class Frame:
@@ -56,6 +58,15 @@ class Frame:
         values = (rgb, depth, camera, label, stamp_ns, frame_id, T_world_camera)
         for field_, value in zip(fields(self), values, strict=True):
             object.__setattr__(self, field_.name, value)
+
+
+def known_counts(counts: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
+    """Depth counts with 0 in place of 65535, which in 16 bits is no distance.
+
+    Some drivers write it where depth is unknown (time-of-flight cameras, saturated pixels), and to others it is the
+    largest count, where whatever is farther is held.
+    """
+    return np.where(counts == SATURATED, counts.dtype.type(0), counts)
 
 
 def _plane(name: str, values: Shaped[np.ndarray, "h w"], dtype: type, rgb: UInt8[np.ndarray, "h w 3"]) -> np.ndarray:

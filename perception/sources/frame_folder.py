@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
 from calibration.camera import Camera
-from perception.sources.frame import Frame
+from perception.sources.frame import SATURATED, Frame, known_counts
 from probnerf.geometry import rigid
 
 DEPTH_UNIT_M = 1e-4  # of the depth.png that is written; 1 mm where that does not reach far enough
@@ -21,12 +21,13 @@ _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 
 
 def read_frame_folder(path: Path | str) -> Frame:
-    """The frame in a folder: color.png, meta.json, and depth.png (16 bit, 0 for unknown) and label.png where they are.
+    """The frame in a folder: color.png, meta.json, and depth.png and label.png where they are.
 
-    meta.json gives `camera_matrix_px` (3x3) and `depth_unit_m` (m per count), and may give `distortion` and
-    `distortion_model` (as `Camera`; none by default), what its calibration knows of their errors
-    (`camera_matrix_std_px`, `distortion_std`, `rms_px`), `stamp_ns` (0), `frame_id` ("camera") and `T_world_camera`
-    (4x4, m); whatever else it holds is not read. With neither depth.png nor depth_unit_m it is a frame without depth.
+    depth.png has 16 bits, and 0 or 65535 where depth is unknown. meta.json gives `camera_matrix_px` (3x3) and
+    `depth_unit_m` (m per count), and may give `distortion` and `distortion_model` (as `Camera`; none by default), what
+    its calibration knows of their errors (`camera_matrix_std_px`, `distortion_std`, `rms_px`), `stamp_ns` (0),
+    `frame_id` ("camera") and `T_world_camera` (4x4, m); whatever else it holds is not read. With neither depth.png nor
+    depth_unit_m it is a frame without depth.
     Raises `FileNotFoundError` or `ValueError` naming the file and the remedy.
     """
     path = Path(path)
@@ -49,7 +50,9 @@ def read_frame_folder(path: Path | str) -> Frame:
                 f"{path / name} is {image.shape[1]}x{image.shape[0]} px but color.png is {width}x{height};"
                 f" align {name} to color.png"
             )
-    depth = None if counts is None else (counts * np.float64(unit)).astype(np.float32)  # Frame turns 0 into NaN
+    depth = None
+    if counts is not None:  # Frame turns 0 into NaN
+        depth = (known_counts(counts) * np.float64(unit)).astype(np.float32)
     try:
         optics = [meta[key] for key in ("camera_matrix_px", "distortion", "distortion_model", *_DEVIATIONS)]
         camera = Camera(width, height, *optics)
@@ -71,9 +74,8 @@ def write_frame_folder(path: Path | str, frame: Frame) -> None:
     """Write a frame as the folder that `read_frame_folder` reads, over an earlier one.
 
     All comes back as it was, but depth only to within half a count of 0.1 mm (1 mm where some is beyond 6.5 m), and
-    what is beyond 65.5 m as 65.5 m. meta.json goes first
-    and comes last, so that a folder that was not finished is not read. Raises `ValueError` for ids that a label.png
-    cannot hold.
+    what is beyond 65.5 m as 65.5 m. meta.json goes first and comes last, so that a folder that was not finished is not
+    read. Raises `ValueError` for ids that a label.png cannot hold.
     """
     path = Path(path)
     if frame.label is not None and not 0 <= frame.label.min() <= frame.label.max() <= 65535:
@@ -81,8 +83,8 @@ def write_frame_folder(path: Path | str, frame: Frame) -> None:
     depth = unit = None
     if frame.depth is not None:
         metres = np.nan_to_num(frame.depth.astype(np.float64))
-        unit = DEPTH_UNIT_M if metres.max() <= 65535 * DEPTH_UNIT_M else 10 * DEPTH_UNIT_M
-        depth = np.minimum(np.rint(metres / unit), 65535).astype(np.uint16)
+        unit = DEPTH_UNIT_M if np.rint(metres.max() / DEPTH_UNIT_M) < SATURATED else 10 * DEPTH_UNIT_M
+        depth = np.minimum(np.rint(metres / unit), SATURATED - 1).astype(np.uint16)
     images = {
         "color.png": frame.rgb[..., ::-1],
         "depth.png": depth,

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from calibration.camera import Camera
-from perception.sources.frame import Frame
+from perception.sources.frame import Frame, known_counts
 from perception.sources.time_limit import within
 
 os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")  # it would end the process where Python raises OSError
@@ -184,7 +184,7 @@ class OakSource:
         rgb = cv2.cvtColor(colour.getCvFrame(), cv2.COLOR_BGR2RGB)
         try:
             camera = self._agreed(opened.camera, colour) if opened.factory else opened.camera
-            z = depth.getFrame().astype(np.uint16, copy=False) * _METRES
+            z = known_counts(depth.getFrame().astype(np.uint16, copy=False)) * _METRES
             return Frame(rgb, z, camera, stamp_ns=stamp_ns, frame_id="oak_rgb_camera_optical_frame"), number
         except ValueError as error:
             raise ValueError(f"{self._images.name}: {error}") from None

@@ -6,6 +6,7 @@ from pathlib import Path
 from calibration.camera import Camera
 from perception.sources.frame import Source, StillSource
 from perception.sources.frame_folder import read_frame_folder
+from perception.sources.topics import TopicNames
 
 # The recording that ships with the project, read when no source is named.
 SHIPPED_LOG = Path(__file__).parent / "shipped.mcap"
@@ -17,13 +18,13 @@ SOURCES = (
 )
 
 
-def open_source(path: Path | str | None, camera: Camera | None = None) -> Source:
+def open_source(path: Path | str | None, camera: Camera | None = None, topics: TopicNames | None = None) -> Source:
     """The source that `path` names; None is the log shipped with the project.
 
     `oak` or `oak:ID` is an OAK camera, `webcam:N` the camera /dev/videoN; else a video file (by its suffix), a frame
     folder (it holds color.png) or a log. A file of such a name is given as ./oak. `camera` is the calibration for a
     webcam or a video file, or in place of what an OAK camera, a log or a frame folder states; it must be of the size of
-    the images.
+    the images. `topics` are those of a log, where others are meant than `Log` finds.
 
     Raises `FileNotFoundError`, `OSError` or `ValueError` with one line that names file or device and the remedy.
     """
@@ -54,4 +55,4 @@ def open_source(path: Path | str | None, camera: Camera | None = None) -> Source
         Log,  # here, because log.py makes Frames; and a folder needs no log libraries
     )
 
-    return Log(path, camera=camera)
+    return Log(path, camera=camera, names=topics)

@@ -13,7 +13,8 @@ from perception.sources.frame_folder import colour_to_rgb, read_png
 from perception.sources.open_source import VIDEO_SUFFIXES, open_source
 from perception.sources.reader import Reader
 from perception.sources.recording import first_messages, open_log
-from perception.sources.ros_images import colour_topic, to_rgb
+from perception.sources.ros_images import to_rgb
+from perception.sources.topics import colour_topic
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -65,7 +66,7 @@ def _newest(source: Source) -> Iterator[Picture]:
 def _logged(path: Path) -> Iterator[Picture]:
     read, kinds, _ = open_log(path)
     firsts = first_messages(read, {topic: kind for topic, kind in kinds.items() if kind in _IMAGES})
-    topic = colour_topic(path, {name: first.message for name, first in firsts.items()})
+    topic, _ = colour_topic(path, {name: first.message for name, first in firsts.items()})
     for number, received in enumerate(read({topic})):
         try:
             yield Picture(f"frame {number}", to_rgb(received.message))

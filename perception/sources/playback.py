@@ -10,6 +10,7 @@ from calibration.camera import Camera
 from perception.sources.frame import Frame, Source
 from perception.sources.open_source import SHIPPED_LOG, open_source
 from perception.sources.recording import Log
+from perception.sources.topics import TopicNames
 
 
 class Playback:
@@ -64,12 +65,13 @@ def open_playback(
     start_s: float = 0.0,
     end_s: float | None = None,
     camera: Camera | None = None,
+    topics: TopicNames | None = None,
 ) -> Source:
-    """The source at `path`, with `camera` in place of its own (see `open_source`); a log as `Playback`.
+    """The source at `path`, with `camera` and `topics` in place of its own (see `open_source`); a log as `Playback`.
 
     Raises ValueError where a range is asked of a source that is no log, and whatever `open_source` raises.
     """
-    source = open_source(path, camera)
+    source = open_source(path, camera, topics)
     if isinstance(source, Log):
         return Playback(source, pace, start_s, end_s)
     if start_s or end_s is not None:

@@ -20,7 +20,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from perception.sources.frame import Frame
+from perception.sources.frame import SATURATED, Frame, known_counts
 from perception.sources.ros_images import MM, POSE_TOPIC
 from perception.sources.schedule_entry import SCHEDULE_TOPIC, Scheduled
 
@@ -287,7 +287,8 @@ def _typed(frame: Frame, config: RecordConfig) -> Iterator[tuple[str, str, Any]]
 def _depth(depth: Float32[np.ndarray, "h w"], config: RecordConfig) -> tuple[Shaped[np.ndarray, "h w"], str]:
     """The samples and their encoding."""
     known = np.where(np.isnan(depth), np.float32(0.0), depth)
-    counts = np.minimum(known * np.float32(1000.0) + np.float32(0.5), np.float32(65535.0)).astype(np.uint16)
+    counts = np.minimum(known * np.float32(1000.0) + np.float32(0.5), np.float32(SATURATED)).astype(np.uint16)
+    counts = known_counts(counts)  # what is beyond 65.5 m counts as unknown, where it is not kept as it is
     if config.depth == "exact":
         return (counts, "16UC1") if np.array_equal(counts * MM, known) else (depth, "32FC1")
-    return np.where(known < 65.5355, counts, np.uint16(0)), "16UC1"
+    return counts, "16UC1"

@@ -2,8 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import takewhile
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +16,6 @@ from calibration.camera import Camera
 from perception.sources.frame import Frame
 from perception.sources.ros_images import (
     POSE_TOPIC,
-    colour_topic,
-    is_depth,
-    is_label,
-    samples,
     stamp_ns,
     to_camera,
     to_depth,
@@ -30,6 +25,7 @@ from perception.sources.ros_images import (
 )
 from perception.sources.schedule_entry import SCHEDULE_TOPIC, Scheduled
 from perception.sources.stamp_matcher import Match, StampMatcher
+from perception.sources.topics import TopicNames, choose, frame_of, is_rectified, other_camera
 
 _KINDS = tuple(f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 _IMAGE, _COMPRESSED, _INFO = _KINDS
@@ -45,11 +41,12 @@ class _Received:
     kind: str  # message type
     log_time: int  # ns
     message: Any
+    by_log_time: bool = False  # some stream of its log has no stamps
 
     @property
     def stamp(self) -> int:
         """The header's stamp (ns), or the time of recording where the driver left it empty."""
-        return stamp_ns(self.message) or self.log_time
+        return self.log_time if self.by_log_time else stamp_ns(self.message) or self.log_time
 
 
 _Read = Callable[[set[str]], Iterator[_Received]]  # the messages of these topics, in order
@@ -58,60 +55,53 @@ _Read = Callable[[set[str]], Iterator[_Received]]  # the messages of these topic
 class Log:
     """The frames of a recording: `.mcap`, `.db3`, a ROS 2 bag folder or a ROS 1 `.bag`.
 
-    Topics are found by type: the colour image, the depth image of the same size, the camera_info beside the colour, and
-    a label image whose topic has a part named label or segmentation. Each colour image takes the depth (and label)
-    nearest in stamp within `tolerance_ns`, and the latest camera_info before it, else the first; or `camera`, where it
-    is given, and then no camera_info is needed. A log without depth
-    gives frames whose depth is None; an MCAP that is cut short gives the frames that are there. T_world_camera is
-    what `Recorder` kept, else None. `notes` says what was missing. Raises `FileNotFoundError` or `ValueError`, one line
-    with the file and the remedy.
+    Topics are chosen as `topics` says, or given as `names`: colour, depth of the same size and camera, the camera_info
+    of that camera, and labels. Each colour image takes the depth (and label) nearest in stamp within `tolerance_ns`,
+    and the latest camera_info before it, else the first; or `camera`, where it is given, and then no camera_info is
+    needed. A log without depth gives frames whose depth is None; an MCAP that is cut short gives the frames that are
+    there. T_world_camera is what `Recorder` kept, else None. `notes` says what was missing. Raises `FileNotFoundError`
+    or `ValueError`, one line with the file and the remedy.
     """
 
     live = False
 
-    def __init__(self, path: Path | str, tolerance_ns: int = 10_000_000, camera: Camera | None = None) -> None:
+    def __init__(
+        self,
+        path: Path | str,
+        tolerance_ns: int = 10_000_000,
+        camera: Camera | None = None,
+        names: TopicNames | None = None,
+    ) -> None:
         self.path = Path(path)
         self.tolerance_ns = tolerance_ns
         self._pairing_notes: list[str] = []
         self._read, kinds, self._notes = open_log(self.path)
-        by_topic = first_messages(self._read, kinds)
-        infos = [topic for topic, first in by_topic.items() if first.kind == _INFO]
-        firsts = [first for first in by_topic.values() if first.kind != _INFO]
-        labels = [f for f in firsts if is_label(f.topic)]
-        depths = [f for f in firsts if f not in labels and is_depth(f.message, f.topic)]
-        colour = by_topic[colour_topic(self.path, {f.topic: f.message for f in firsts})]
-        self.colour_topic = colour.topic
-
-        def kinship(topic: str) -> int:  # leading parts of the name shared with the colour topic
-            pairs = zip(topic.split("/"), colour.topic.split("/"), strict=False)
-            return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
-
-        self.info_topic = max(infos, key=kinship, default=None) if camera is None else None
+        firsts = first_messages(self._read, kinds)
+        images = {topic: first.message for topic, first in firsts.items() if first.kind != _INFO}
+        infos = {topic: first.message for topic, first in firsts.items() if first.kind == _INFO and camera is None}
+        chosen = choose(self.path, images, infos, names or TopicNames())
+        self.colour_topic, self.depth_topic, self.label_topic = chosen.colour, chosen.depth, chosen.label
+        self.info_topic = chosen.info
+        self._notes += chosen.notes
+        self._colour = images[chosen.colour]  # the first one
         if camera is not None:
             self._first_camera = camera
         elif self.info_topic is not None:
-            self._first_camera = self._camera(by_topic[self.info_topic])
+            self._first_camera = self._camera(firsts[self.info_topic])
         else:
             raise ValueError(
                 f"{self.path} has no camera_info; record the camera_info topic beside {self.colour_topic}, or give a"
-                " camera file (replay --camera)"
+                " camera file (--camera)"
             )
-        size = self._size(colour)
-        fitting = [f for f in depths if self._size(f) == size]
-        if depths and not fitting:
-            raise ValueError(
-                f"{self.path}: depth on {depths[0].topic} is {self._size(depths[0])} px but colour on {colour.topic} is"
-                f" {size}; record the depth that is aligned to colour"
-            )
-        depth = max(fitting, key=lambda f: ("aligned" in f.topic, kinship(f.topic)), default=None)
-        label = max(labels, key=lambda f: kinship(f.topic), default=None)
-        self.depth_topic = depth.topic if depth else None
-        self.label_topic = label.topic if label else None
         self._pose_topic = POSE_TOPIC if POSE_TOPIC in kinds else None
-        if depth is None:
-            self._notes.append(f"{self.path.name} has no depth image; its frames carry colour alone")
-        elif (a := depth.message.header.frame_id) != (b := colour.message.header.frame_id):
-            self._notes.append(f"{self.path.name}: depth is in frame {a!r} and colour in {b!r}; taken as aligned")
+        paired = [topic for topic in (chosen.colour, chosen.depth, chosen.label) if topic]
+        unstamped = [topic for topic in paired if not stamp_ns(firsts[topic].message)]
+        self._by_log_time = bool(unstamped)
+        if unstamped:
+            self._notes.append(
+                f"{self.path.name}: stamps on {', '.join(unstamped)} are empty; all images have the time of recording,"
+                " by which they may be paired wrongly: set header.stamp in the driver"
+            )
 
     @property
     def notes(self) -> list[str]:
@@ -182,6 +172,7 @@ class Log:
         matcher: StampMatcher[tuple[_Received, Camera], _Received] = StampMatcher(streams, self.tolerance_ns)
         camera = self._first_camera
         for received in self._read({self.colour_topic, *filter(None, [self.info_topic]), *streams}):
+            received = replace(received, by_log_time=self._by_log_time)
             if received.topic == self.info_topic:
                 camera = self._camera(received)
             elif received.topic == self.colour_topic:
@@ -208,7 +199,7 @@ class Log:
                 camera,
                 label=ids,
                 stamp_ns=colour.stamp,
-                frame_id=colour.message.header.frame_id,
+                frame_id=frame_of(colour.message),
                 T_world_camera=T,
             )
         except ValueError as error:
@@ -216,13 +207,9 @@ class Log:
 
     def _camera(self, received: _Received) -> Camera:
         try:
-            return to_camera(received.message, rectified="rect" in self.colour_topic)
-        except ValueError as error:
-            raise ValueError(f"{self.path}: {received.topic}: {error}") from None
-
-    def _size(self, received: _Received) -> str:
-        try:
-            return "{1}x{0}".format(*samples(received.message).shape)
+            if why := other_camera(received.message, self._colour):
+                raise ValueError(f"it {why}; record one camera's, or give a camera file (--camera)")
+            return to_camera(received.message, is_rectified(self.colour_topic))
         except ValueError as error:
             raise ValueError(f"{self.path}: {received.topic}: {error}") from None
 

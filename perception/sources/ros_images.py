@@ -1,7 +1,5 @@
 """What image and camera_info messages hold, as arrays. Messages are read by their fields, whoever decoded them."""
 
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -10,6 +8,7 @@ from jaxtyping import Float, Float32, Int32, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
+from perception.sources.frame import known_counts
 from perception.sources.frame_folder import colour_to_rgb
 
 POSE_TOPIC = "/camera/color/pose"  # where a Farside recording keeps T_world_camera (geometry_msgs/PoseStamped)
@@ -32,31 +31,6 @@ def encoding_of(message: Any) -> str:
     return first if first in _ENCODINGS else "bgr8"
 
 
-def is_depth(message: Any, topic: str) -> bool:
-    """Whether an image measures distance (some drivers call their depth mono16)."""
-    encoding = encoding_of(message)
-    return encoding in ("16UC1", "32FC1") or (encoding == "mono16" and "depth" in topic)
-
-
-def is_label(topic: str) -> bool:
-    """Whether a topic's name has a part that says label or segmentation."""
-    return bool({"label", "segmentation"} & set(topic.split("/")))
-
-
-def colour_topic(path: Path, firsts: Mapping[str, Any]) -> str:
-    """Which of these topics of a recording, each with one image of it, is the colour. Raises ValueError for none."""
-    found = [t for t, message in firsts.items() if not is_label(t) and encoding_of(message) in COLOURS]
-    if not found:
-        seen = ", ".join(f"{t} ({encoding_of(message)})" for t, message in firsts.items()) or "none"
-        raise ValueError(f"{path} has no colour image (images: {seen}); record one as {', '.join(COLOURS)} or JPEG")
-
-    def rank(topic: str) -> tuple[bool, bool, bool]:  # infrared is mono8 too; a raw picture needs no decoding
-        named = any(name in topic for name in ("color", "colour", "rgb"))
-        return encoding_of(firsts[topic]) != "mono8", named, hasattr(firsts[topic], "encoding")
-
-    return max(found, key=rank)
-
-
 def to_rgb(message: Any) -> UInt8[np.ndarray, "h w 3"]:
     """A colour image. Raises `ValueError` where the message does not hold one."""
     image = samples(message)
@@ -67,9 +41,9 @@ def to_rgb(message: Any) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def to_depth(message: Any) -> Float32[np.ndarray, "h w"]:
-    """A depth image in metres (REP 118: integers are millimetres), 0 or NaN where unknown."""
+    """A depth image in metres (REP 118: integers are millimetres), 0 or NaN where unknown; so is the count 65535."""
     image = _plane(message)
-    return image * MM if image.dtype.kind == "u" else image.astype(np.float32)
+    return known_counts(image) * MM if image.dtype.kind == "u" else image.astype(np.float32)
 
 
 def to_label(message: Any) -> Int32[np.ndarray, "h w"]:

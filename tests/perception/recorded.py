@@ -39,7 +39,7 @@ def some_frames(count: int, camera: Camera = CAMERA, period_ms: int = 33) -> lis
     shape = (camera.height, camera.width)
     frames = []
     for i in range(count):
-        mm = (rng.integers(1, 65536, shape) * (rng.random(shape) > 0.2)).astype(np.uint16)
+        mm = (rng.integers(1, 65535, shape) * (rng.random(shape) > 0.2)).astype(np.uint16)
         stamp_ns = CLOCK_NS + 7_000_123_000 + i * period_ms * 1_000_000
         rgb = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
         frames.append(Frame(rgb, mm * np.float32(1e-3), camera, stamp_ns=stamp_ns))

@@ -22,10 +22,10 @@ def picture(seed: int, shape: tuple[int, ...] = (HEIGHT, WIDTH, 3)) -> np.ndarra
     return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
 
-def image(stamp: int, array: np.ndarray, encoding: str) -> Any:
+def image(stamp: int, array: np.ndarray, encoding: str, frame: str = "cam_optical") -> Any:
     return make(
         "sensor_msgs/msg/Image",
-        header=header(stamp, "cam_optical"),
+        header=header(stamp, frame),
         height=array.shape[0],
         width=array.shape[1],
         encoding=encoding,
@@ -43,13 +43,13 @@ class Driver:
         self.depth = bus.publisher(DEPTH, "sensor_msgs/msg/Image")
         self.info = bus.publisher(INFO, "sensor_msgs/msg/CameraInfo")
 
-    def say_info(self, width: int = WIDTH) -> None:
+    def say_info(self, width: int = WIDTH, frame: str = "cam_optical") -> None:
         K = np.array([30.0, 0, 15.5, 0, 30.0, 11.5, 0, 0, 1])
         P = np.array([40.0, 0, 15.5, 0, 0, 40.0, 11.5, 0, 0, 0, 1, 0])
         d = np.array([0.1, 0, 0, 0, 0])
         size: dict = {"height": HEIGHT, "width": width}
         size |= {"distortion_model": "plumb_bob", "d": d, "k": K, "p": P}
-        self.info.publish(make("sensor_msgs/msg/CameraInfo", header=header(START, "cam_optical"), **size))
+        self.info.publish(make("sensor_msgs/msg/CameraInfo", header=header(START, frame), **size))
 
     def say(self, i: int, late_ns: int = 0, shape: tuple[int, ...] = (HEIGHT, WIDTH, 3)) -> None:
         stamp = START + i * 33 * MS
@@ -96,7 +96,10 @@ def test_compressed_and_rectified_without_depth(bus: Bus) -> None:
     driver.say_info()
     png = cv2.imencode(".png", picture(5)[..., ::-1])[1].ravel()
     packed = make(
-        "sensor_msgs/msg/CompressedImage", header=header(START, "cam"), format="rgb8; png compressed bgr8", data=png
+        "sensor_msgs/msg/CompressedImage",
+        header=header(START, "cam_optical"),
+        format="rgb8; png compressed bgr8",
+        data=png,
     )
     driver.packed.publish(packed)
     frame = next(iter(source))
@@ -144,3 +147,62 @@ def test_silence_is_said_with_the_topics_that_are_missing(bus: Bus) -> None:
 def test_configuration_is_checked() -> None:
     with pytest.raises(ValueError, match="silence_s be positive"):
         TopicConfig(silence_s=0.0)
+    with pytest.raises(ValueError, match="/farside/uncertainty, whose name says uncertainty"):
+        TopicConfig(depth="/farside/uncertainty")
+
+
+@pytest.mark.parametrize(
+    ("frame", "values", "parts"),
+    [
+        ("cam_depth", 0.5, ("'cam_depth'", "'cam_optical'", "not aligned", "aligned: true")),
+        ("cam_optical", 500.0, ("median is 500 m", DEPTH)),
+        ("cam_optical", -0.5, ("100% of its values are negative", DEPTH)),
+    ],
+)
+def test_what_is_no_depth_of_this_camera_is_refused(bus: Bus, frame: str, values: float, parts: tuple) -> None:
+    source, driver = TopicSource(bus, config(end_s=0.6)), Driver(bus)
+    driver.say_info()
+    for i in range(2):
+        driver.colour.publish(image(START + i * MS * 33, picture(i), "rgb8"))
+        depth = np.full((HEIGHT, WIDTH), values, np.float32)
+        driver.depth.publish(image(START + i * MS * 33, depth, "32FC1", frame))
+    assert list(source) == [] and len(source.notes) == 1
+    for part in ("frames are left out", *parts):
+        assert part in source.notes[0]
+
+
+def test_depth_that_is_said_to_be_aligned_is_taken(bus: Bus) -> None:
+    source, driver = TopicSource(bus, config(aligned=True)), Driver(bus)
+    driver.say_info()
+    driver.colour.publish(image(START, picture(0), "rgb8"))
+    driver.depth.publish(image(START, np.full((HEIGHT, WIDTH), 500, np.uint16), "16UC1", "cam_depth"))
+    assert next(iter(source)).depth is not None and source.notes == []
+
+
+def test_camera_info_of_another_camera_is_refused(bus: Bus) -> None:
+    source, driver = TopicSource(bus, config(end_s=0.6)), Driver(bus)
+    driver.say_info(frame="other")
+    driver.say(0)
+    assert list(source) == []
+    for part in (INFO, "'other'", COLOUR, "'cam_optical'", "another camera's"):
+        assert part in source.notes[0]
+
+
+@pytest.mark.parametrize(("topic", "focal"), [("/cam/image_rect_color", 40.0), ("/cam/corrected/image", 30.0)])
+def test_a_rectified_topic_has_the_camera_of_p(bus: Bus, topic: str, focal: float) -> None:
+    source, driver = TopicSource(bus, config(colour=topic, depth=None)), Driver(bus)
+    driver.say_info()
+    bus.publisher(topic, "sensor_msgs/msg/Image").publish(image(START, picture(0), "rgb8"))
+    camera = next(iter(source)).camera
+    assert camera.K[0, 0] == focal and camera.distortion.any() == (focal == 30.0)
+
+
+def test_empty_stamps_become_the_time_of_arrival_and_are_said(bus: Bus) -> None:
+    source, driver = TopicSource(bus, config(tolerance_ms=2000.0)), Driver(bus)
+    driver.say_info()
+    before = time.time_ns()
+    driver.colour.publish(image(0, picture(0), "rgb8"))
+    driver.depth.publish(image(0, np.full((HEIGHT, WIDTH), 500, np.uint16), "16UC1"))
+    frame = next(iter(source))
+    assert before <= frame.stamp_ns <= time.time_ns() and frame.depth is not None
+    assert len(source.notes) == 2 and f"stamps on {COLOUR} are empty" in " ".join(source.notes)

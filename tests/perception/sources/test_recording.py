@@ -79,13 +79,15 @@ def maker(kind: str) -> Any:
     """Functions that make (topic, type, stamp, message) in ROS 1 or ROS 2."""
     t = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_JAZZY).types
 
-    def header(stamp: int) -> Any:
+    def header(stamp: int, frame: str = "cam") -> Any:
         time = t["builtin_interfaces/msg/Time"](*divmod(stamp, 1_000_000_000))
-        return t["std_msgs/msg/Header"](*([0] if kind == "bag" else []), stamp=time, frame_id="cam")
+        return t["std_msgs/msg/Header"](*([0] if kind == "bag" else []), stamp=time, frame_id=frame)
 
     class Make:
         @staticmethod
-        def image(topic: str, stamp: int, array: np.ndarray, encoding: str, big: int = 0, pad: int = 0) -> Message:
+        def image(
+            topic: str, stamp: int, array: np.ndarray, encoding: str, big: int = 0, pad: int = 0, frame: str = "cam"
+        ) -> Message:
             rows = np.ascontiguousarray(array).view(np.uint8).reshape(len(array), -1)
             rows = np.pad(rows, ((0, 0), (0, pad)))
             image = t["sensor_msgs/msg/Image"]
@@ -94,7 +96,7 @@ def maker(kind: str) -> Any:
                 topic,
                 "sensor_msgs/msg/Image",
                 stamp,
-                image(header(stamp), *size, encoding, big, rows.shape[1], rows.ravel()),
+                image(header(stamp, frame), *size, encoding, big, rows.shape[1], rows.ravel()),
             )
 
         @staticmethod
@@ -104,7 +106,11 @@ def maker(kind: str) -> Any:
 
         @staticmethod
         def info(
-            stamp: int, fx: float = 90.0, topic: str = "/cam/camera_info", size: tuple[int, int] = (48, 64)
+            stamp: int,
+            fx: float = 90.0,
+            topic: str = "/cam/camera_info",
+            size: tuple[int, int] = (48, 64),
+            frame: str = "cam",
         ) -> Message:
             name = "sensor_msgs/msg/CameraInfo"
             K = np.array([fx, 0, 31, 0, 91, 23, 0, 0, 1.0])
@@ -114,7 +120,7 @@ def maker(kind: str) -> Any:
                 topic,
                 name,
                 stamp,
-                t[name](header(stamp), *size, "plumb_bob", np.zeros(5), K, np.eye(3).ravel(), P, 0, 0, roi),
+                t[name](header(stamp, frame), *size, "plumb_bob", np.zeros(5), K, np.eye(3).ravel(), P, 0, 0, roi),
             )
 
     return Make
@@ -275,11 +281,11 @@ def test_colour_takes_the_nearest_depth_and_the_latest_camera(tmp_path: Path) ->
         messages.append(make.image("/cam/image", START + 33 * i * MS, RGB, "rgb8"))
         for j in range(3):
             k = 3 * i + j
-            messages.append(make.image("/cam/depth", START + (11 * k + 3) * MS, np.full_like(MM, k + 1), "16UC1"))
+            messages.append(make.image("/cam/depth", START + (11 * k + 3) * MS, np.full_like(MM, 500 + k), "16UC1"))
         if i in (5, 20):
             messages.append(make.info(START + (33 * i + 1) * MS, fx=100.0 + i))
     read = list(Log(record(tmp_path / "x", "mcap", sorted(messages, key=lambda m: m[2]))))
-    assert [round(float(f.depth[0, 0]) * 1000) for f in read] == [3 * i + 1 for i in range(50)]
+    assert [round(float(f.depth[0, 0]) * 1000) for f in read] == [500 + 3 * i for i in range(50)]
     assert [f.camera.K[0, 0] for f in read] == [105.0] * 21 + [120.0] * 29
 
 

@@ -1,0 +1,242 @@
+"""Which topics of a recording are its colour, depth, label and camera_info.
+
+They are chosen by message type, by whole parts of their names (`/cam/image_rect_color` has the parts cam, image, rect
+and color), by the frame_id of their first message and by what the first depth image holds. What is not chosen although
+it might be meant is named in a note.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from perception.sources.ros_images import COLOURS, encoding_of, samples, to_depth
+
+_COLOUR_PARTS = {"color", "colour", "rgb"}
+_LABEL_PARTS = {"label", "labels", "segmentation"}
+# A depth camera's other images, and those of this node.
+_NO_DEPTH_PARTS = {
+    *("confidence", "uncertainty", "variance", "covariance", "sigma", "std", "stddev", "error", "noise", "quality"),
+    *("disparity", "amplitude", "intensity", "probability", "mask", "weight", "weights", "normal", "normals"),
+}
+_NO_PICTURE_PARTS = {"confidence", "uncertainty", "mask", "disparity", "depth"}
+_INFRARED_PARTS = {"ir", "infra", "infrared", "thermal"}
+_LABEL_ENCODINGS = ("mono8", "8UC1", "mono16", "16UC1")
+_TRANSPORTS = {"compressed", "compressedDepth"}
+_NEAREST_M, _FARTHEST_M = 0.01, 50.0  # between which the median of a depth image of things on a table lies
+
+
+@dataclass(frozen=True)
+class TopicNames:
+    """Topics of a recording that are given by name; None: the one that is found."""
+
+    colour: str | None = None
+    depth: str | None = None  # taken as aligned to colour, whatever its frame_id
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Topics of one camera."""
+
+    colour: str
+    depth: str | None
+    label: str | None
+    info: str | None
+    notes: tuple[str, ...]
+
+
+def name_parts(topic: str) -> set[str]:
+    """The words of a topic's name, in small letters, parted at everything that is no letter."""
+    return set(re.findall("[a-z]+", topic.lower()))
+
+
+def is_rectified(topic: str) -> bool:
+    """Whether an image topic's name says that its images are rectified."""
+    return bool({"rect", "rectified"} & name_parts(topic))
+
+
+def frame_of(message: Any) -> str:
+    """The frame_id, without the leading slash of ROS 1; empty where the driver gives none."""
+    return message.header.frame_id.lstrip("/")
+
+
+def other_camera(info: Any, colour: Any) -> str | None:
+    """The words that tell of a camera_info of another camera than the image's; None where frame_id does not differ."""
+    a, b = frame_of(info), frame_of(colour)
+    return f"is of frame {a!r} but colour is of frame {b!r}, so it is another camera's" if a and b and a != b else None
+
+
+def not_aligned(depth: Any, colour: Any) -> str | None:
+    """The words that tell of depth of another camera than colour's; None where frame_id does not differ."""
+    a, b = frame_of(depth), frame_of(colour)
+    return f"is of frame {a!r} but colour is of frame {b!r}, so it is not aligned" if a and b and a != b else None
+
+
+def named_otherwise(topic: str) -> str | None:
+    """The part of a topic's name that says that its images are no depth."""
+    return next(iter(sorted(_NO_DEPTH_PARTS & name_parts(topic))), None)
+
+
+def doubt(depth: Float32[np.ndarray, "h w"]) -> str | None:
+    """What tells that an image is no depth in metres (0 or NaN where unknown); None where nothing does."""
+    values = depth[np.isfinite(depth) & (depth != 0)]
+    if not values.size:
+        return None
+    if (share := float((values < 0).mean())) > 0.01:
+        return f"{100 * share:.0f}% of its values are negative"
+    median = float(np.median(values))
+    if not _NEAREST_M <= median <= _FARTHEST_M:
+        return f"its median is {median:.3g} m, where {_NEAREST_M:g} to {_FARTHEST_M:g} m are expected"
+    return None
+
+
+def colour_topic(path: Path, firsts: Mapping[str, Any], name: str | None = None) -> tuple[str, list[str]]:
+    """The colour among topics, each with its first image, and notes. Raises ValueError where there is none.
+
+    `name` is the topic that was asked for.
+    """
+    found = [t for t, m in firsts.items() if encoding_of(m) in COLOURS and (t == name or _is_picture(t))]
+    if not found or (name is not None and name not in found):
+        seen = ", ".join(f"{t} ({encoding_of(message)})" for t, message in firsts.items()) or "none"
+        what = "no colour image" if name is None else f"no colour image on {name}"
+        raise ValueError(f"{path} has {what} (images: {seen}); record one as {', '.join(COLOURS)} or JPEG")
+    if name is not None:
+        return name, []
+
+    def rank(topic: str) -> tuple[bool, ...]:  # infrared is mono8 too; what this node passed on is a copy
+        own = "farside" in topic.split("/")
+        return encoding_of(firsts[topic]) != "mono8", not own, bool(_COLOUR_PARTS & name_parts(topic))
+
+    best = max(found, key=lambda t: (*rank(t), hasattr(firsts[t], "encoding")))  # a raw picture needs no decoding
+    frame = frame_of(firsts[best])
+    others = [t for t in found if rank(t) == rank(best) and frame_of(firsts[t]) != frame]
+    notes = [f"{path.name}: colour is also on {', '.join(others)}; {best} is taken (choose with --colour-topic)"]
+    return best, notes if others else []
+
+
+def choose(path: Path, images: Mapping[str, Any], infos: Mapping[str, Any], names: TopicNames) -> Chosen:
+    """The topics of one camera among those of a recording, each given with its first message.
+
+    Raises ValueError, with the topic and the remedy, where there is no colour, or where depth or camera_info is another
+    camera's.
+    """
+    colour, notes = colour_topic(path, images, names.colour)
+    depth, about_depth = _depth_topic(path, images, colour, names.depth)
+    named = {t: m for t, m in images.items() if _LABEL_PARTS & name_parts(t)}
+    labels = [
+        t for t, m in named.items() if encoding_of(m) in _LABEL_ENCODINGS and not_aligned(m, images[colour]) is None
+    ]
+    label = max(labels, key=lambda t: _kinship(t, colour), default=None)
+    return Chosen(colour, depth, label, _info_topic(path, infos, images, colour), (*notes, *about_depth))
+
+
+def _is_picture(topic: str) -> bool:
+    return not (_LABEL_PARTS | _NO_PICTURE_PARTS) & name_parts(topic) or bool(_COLOUR_PARTS & name_parts(topic))
+
+
+def _depth_topic(path: Path, images: Mapping[str, Any], colour: str, name: str | None) -> tuple[str | None, list[str]]:
+    if name is not None:
+        if name not in images:
+            raise ValueError(f"{path} has no image on {name}; its images are on {', '.join(images)}")
+        found, notes = [name], list[str]()
+    else:
+        found, notes = _named_depth(path, images)
+    size = _size(path, colour, images[colour])
+    sizes = {t: _size(path, t, images[t]) for t in found}
+    fitting = [t for t in found if sizes[t] == size]
+    if found and not fitting:
+        raise ValueError(
+            f"{path}: depth on {found[0]} is {sizes[found[0]]} px but colour on {colour} is {size}; record the depth"
+            " that is aligned to colour"
+        )
+    apart = {t: why for t in fitting if (why := not_aligned(images[t], images[colour]))}
+    aligned = [t for t in fitting if t not in apart or t == name]
+    if fitting and not aligned:
+        raise ValueError(
+            f"{path}: depth on {fitting[0]} {apart[fitting[0]]}; record the depth that is aligned to {colour}, or,"
+            f" if it is, give --depth-topic {fitting[0]}"
+        )
+    doubts = {t: why for t in aligned if (why := _doubt(path, t, images[t]))}
+    remedy = "record metres as 32FC1 or millimetres as 16UC1"
+    if name in doubts:
+        raise ValueError(f"{path}: {name} is no depth: {doubts[name]}; {remedy}, or give another --depth-topic")
+    notes += [f"{path.name}: {t} is not taken for depth: {why}; {remedy}" for t, why in doubts.items()]
+    if name in apart:
+        notes.append(f"{path.name}: depth {apart[name]} by frame_id; taken as aligned, since it was given")
+    taken = [t for t in aligned if t not in doubts]
+    best = max(taken, key=lambda t: ("aligned" in name_parts(t), _kinship(t, colour)), default=None)
+    if best is None:
+        notes.append(f"{path.name} has no depth image; its frames carry colour alone")
+    return best, notes
+
+
+def _named_depth(path: Path, images: Mapping[str, Any]) -> tuple[list[str], list[str]]:
+    """The topics whose name or transport says depth, and notes on those that might be."""
+    found, unsaid = [], []
+    for topic, message in images.items():
+        parts, encoding = name_parts(topic), encoding_of(message)
+        if encoding not in ("16UC1", "mono16", "32FC1") or parts & (_LABEL_PARTS | _NO_DEPTH_PARTS):
+            continue
+        if "depth" in parts or "compressedDepth" in getattr(message, "format", ""):
+            found.append(topic)
+        elif encoding != "mono16" and not parts & _INFRARED_PARTS:
+            unsaid.append(f"{topic} ({encoding})")
+    if found or not unsaid:
+        return found, []
+    said = f"{path.name}: {', '.join(unsaid)} may be depth, but no part of the name says depth, so it is not used"
+    return found, [f"{said}; if it is, choose it with --depth-topic"]
+
+
+def _info_topic(path: Path, infos: Mapping[str, Any], images: Mapping[str, Any], colour: str) -> str | None:
+    """The camera_info of the colour's camera: of its frame_id where both have one, and rather of its namespace."""
+    image = images[colour]
+    same = [t for t in infos if other_camera(infos[t], image) is None]
+    remedy = f"record the camera_info of {colour}, or give a camera file (--camera)"
+    if infos and not same:
+        topic = max(infos, key=lambda t: _kinship(t, colour))
+        raise ValueError(f"{path}: camera_info on {topic} {other_camera(infos[topic], image)} ({colour}); {remedy}")
+
+    def rank(topic: str) -> tuple[bool, bool, int]:
+        exact = bool(frame_of(image)) and frame_of(infos[topic]) == frame_of(image)
+        return exact, _segments(topic)[:-1] == _segments(colour)[:-1], _kinship(topic, colour)
+
+    best = max(same, key=rank, default=None)
+    if best is not None and len(infos) > 1 and not any(rank(best)):
+        raise ValueError(
+            f"{path}: neither frame_id nor namespace tells which camera_info ({', '.join(same)}) is that of {colour};"
+            f" {remedy}"
+        )
+    return best
+
+
+def _segments(topic: str) -> list[str]:
+    parts = topic.strip("/").split("/")
+    return parts[:-1] if parts[-1] in _TRANSPORTS else parts
+
+
+def _kinship(topic: str, other: str) -> int:
+    """How many leading parts of their paths two topics share, their own names left out."""
+    count = 0
+    for a, b in zip(_segments(topic)[:-1], _segments(other)[:-1], strict=False):
+        if a != b:
+            break
+        count += 1
+    return count
+
+
+def _size(path: Path, topic: str, message: Any) -> str:
+    try:
+        return "{1}x{0}".format(*samples(message).shape)
+    except ValueError as error:
+        raise ValueError(f"{path}: {topic}: {error}") from None
+
+
+def _doubt(path: Path, topic: str, message: Any) -> str | None:
+    try:
+        return doubt(to_depth(message))
+    except ValueError as error:
+        raise ValueError(f"{path}: {topic}: {error}") from None
