@@ -155,10 +155,10 @@ def _fit(views: Sequence[View], size: tuple[int, int], model: Model) -> tuple[Ca
         rvec, tvec = np.reshape(rvec, 3), np.reshape(tvec, 3)
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = cv2.Rodrigues(rvec)[0], tvec
-        predicted, *jacobian = camera.project_posed(view.points, rvec, tvec)
+        predicted, inner, outer = camera.project_posed(view.points, rvec, tvec)
         fitted.append(FittedView(view, T, view.pixels - predicted))
         residuals.append((view.pixels - predicted).ravel())
-        jacobians.append(tuple(jacobian))
+        jacobians.append((inner, outer))
     rss = float((np.concatenate(residuals) ** 2).sum())
     count = sum(len(r) for r in residuals)
     free = max(count - 4 - len(D) - 6 * len(views), 1)
