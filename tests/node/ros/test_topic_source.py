@@ -115,6 +115,7 @@ def test_a_colour_without_its_depth_is_dropped(bus: Bus) -> None:
         wait_for(bus, i + 1)
     assert list(source) == [] and source.dropped == 6
     assert "dropped for want of depth within 10 ms (the nearest was 15.0 ms" in source.notes[0]
+    assert source.notes[0].endswith(" times)")
 
 
 def test_only_the_newest_frame_waits(bus: Bus) -> None:
