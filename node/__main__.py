@@ -119,13 +119,13 @@ def _view(args: Sequence[str]) -> int:
             raise ValueError("--out draws a file's picture; leave it away with --live")
         from node.commands.view_live import watch
 
-        watch(options.live, options.node, options.port, Console(), Console(stderr=True))
+        watch(options.live, options.node, options.port, options.token, Console(), Console(stderr=True))
         return 0
     from node.commands.view import draw, open_page
 
     assert options.file is not None
     if options.out is None:
-        open_page(options.file, options.port, Console(), Console(stderr=True))
+        open_page(options.file, options.port, options.token, Console(), Console(stderr=True))
     else:
         draw(options.file, options.out, Console(), Console(stderr=True))
     return 0

@@ -82,6 +82,8 @@ class Live:
     """Record every frame, the hypotheses and their schedule to a new file; `farside replay --schedule` repeats it."""
     page: Annotated[int | None, arg(metavar="PORT", help_behavior_hint="(default: no page)")] = None
     """Show a 3D page on this port of this machine; 0 takes a free one."""
+    token: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Put a random token into the page's address: nobody else on this machine can open it."""
     budget: Annotated[float, arg(metavar="SECONDS")] = 40.0
     """Sampling time for each object of a frame; what has not converged goes on with the next one."""
     pace: Annotated[float, arg(metavar="X")] = 1.0
@@ -163,6 +165,8 @@ class View:
     """Open no page; draw the object's picture here, or for several objects into this folder."""
     port: Annotated[int, arg(metavar="N")] = 8765
     """Port of the page on this machine (127.0.0.1); 0 takes a free one."""
+    token: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Put a random token into the page's address: nobody else on this machine can open it."""
 
 
 @dataclass(frozen=True)

@@ -88,7 +88,8 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "mcap": ("perception/sources/recording.py", "perception/sources/recorder.py"),
     "yaml": ("calibration/camera_file.py", "node/commands/config_file.py"),  # camera files; launch files
     "zenoh": ("node/ros/bus.py",),
-    "viser": ("node/viewer/page.py",),
+    "viser": ("node/viewer/page.py", "node/viewer/page_guard.py"),
+    "websockets": ("node/viewer/page_guard.py",),  # viser's server
     "xxhash": ("node/ros/rmw_zenoh.py",),
     "tyro": ("node/__main__.py", "node/options.py", "benchmarks/*", "examples/*"),
     "trimesh": ("perception/answers/regions.py", "benchmarks/scenes/meshes.py"),

@@ -58,6 +58,7 @@ class LiveConfig:
     pace: float = 1.0  # of a recording
     seconds: float | None = None  # until it ends by itself
     page: int | None = None  # port of the page on this machine; None: no page
+    token: bool = False  # in the page's address, a random one
     seed: int = 0
     prior: Path | None = None
     bus: BusConfig = field(default_factory=lambda: BusConfig(listen=(ENDPOINT,)))
@@ -68,6 +69,8 @@ class LiveConfig:
     track: TrackConfig = field(default_factory=TrackConfig)
 
     def __post_init__(self) -> None:
+        if self.token and self.page is None:
+            raise ValueError("a token is in the page's address; give the page's port, too")
         if not self.budget > 0:
             raise ValueError(f"the budget is {self.budget:g} s; give more than 0")
         if self.seconds is not None and not self.seconds > 0:
@@ -91,7 +94,7 @@ def live(config: LiveConfig, out: Console, err: Console) -> None:
         if config.page is not None:
             from node.viewer.page import Page  # viser takes a second to import
 
-            page = stack.enter_context(Page(config.page))
+            page = stack.enter_context(Page(config.page, config.token))
         recorder = None  # after all that may fail: a run that did not begin leaves no file
         if config.record is not None:
             recorder = Recorder(config.record, config.recording)

@@ -14,8 +14,8 @@ from perception.answers.hypotheses_file import frame_path, load_scene
 from perception.sources.frame_folder import read_frame_folder
 
 
-def open_page(path: Path, port: int, out: Console, err: Console) -> None:
-    """Show the objects of a hypotheses file or folder on the page until Ctrl-C.
+def open_page(path: Path, port: int, token: bool, out: Console, err: Console) -> None:
+    """Show the objects of a hypotheses file or folder on the page until Ctrl-C; `token` as `Page`.
 
     Raises FileNotFoundError, ValueError or OSError in one line: no such file, or a port that is in use.
     """
@@ -23,7 +23,7 @@ def open_page(path: Path, port: int, out: Console, err: Console) -> None:
 
     scene = load_scene(path)
     view = load_view(path, scene, err)
-    with Page(port) as page:
+    with Page(port, token) as page:
         page.show(scene, view)
         for h in scene:
             report(h, out)

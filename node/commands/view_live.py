@@ -18,8 +18,8 @@ from perception.sources.frame import Frame
 FRAMES = 300  # that are kept until their hypotheses come
 
 
-def watch(endpoint: str, node: str, port: int, out: Console, err: Console) -> None:
-    """Show what the node `node` (such as /farside) at `endpoint` says, until Ctrl-C.
+def watch(endpoint: str, node: str, port: int, token: bool, out: Console, err: Console) -> None:
+    """Show what the node `node` (such as /farside) at `endpoint` says, until Ctrl-C; `token` as `Page`.
 
     Raises ValueError or OSError in one line: no endpoint, nobody there, or a port that is in use.
     """
@@ -29,7 +29,7 @@ def watch(endpoint: str, node: str, port: int, out: Console, err: Console) -> No
         err.print(text, highlight=False, soft_wrap=True)
 
     config = BusConfig(name="farside_view", connect=(endpoint,))
-    with Bus(config, say) as bus, Page(port) as page:
+    with Bus(config, say) as bus, Page(port, token) as page:
         source = TopicSource(bus, camera_topics(node))
         shown = Shown()
         threading.Thread(target=shown.keep, args=(source,), daemon=True).start()

@@ -1,14 +1,11 @@
-"""The page: a scene in 3D in a browser on this machine, with a box to ask about. The only file that knows viser.
+"""The page: a scene in 3D in a browser on this machine, with a box to ask about.
 
-Everything is served from and to 127.0.0.1. `show` may be called from any thread, as viser calls back from its own.
+Everything is served from and to 127.0.0.1, to the page alone (`page_guard`). `show` may be called from any thread, as
+viser calls back from its own.
 """
 
-import contextlib
-import errno
-import io
-import socket
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Any
 
@@ -19,27 +16,23 @@ from viser.transforms import SO3
 
 from node.figures import voxel_renderer
 from node.viewer import panel, scene3d
+from node.viewer.page_guard import GuardedServer
 from node.viewer.scene3d import CameraView, Placed
 from perception.answers.hypotheses import Hypotheses
 from probnerf.types import BASE_Z
 
-HOST = "127.0.0.1"
 NEXT_VIEWS = 5  # shown
-
-
-class _Loopback(viser.ViserServer):
-    """viser without its tunnel to a public server, which any client could ask for."""
-
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        return None
 
 
 class Page:
     """A page on 127.0.0.1 that shows one scene at a time. Close it, or use it in a `with`."""
 
-    def __init__(self, port: int = 8765) -> None:
-        """Open the page; port 0 takes a free one. Raises OSError or ValueError where `port` cannot be had."""
-        self._server = _serve(port)
+    def __init__(self, port: int = 8765, token: bool = False) -> None:
+        """Open the page; port 0 takes a free one, and with `token` only who knows the address sees it.
+
+        Raises OSError or ValueError where `port` cannot be had.
+        """
+        self._server = GuardedServer(port, token)
         self._lock = threading.RLock()  # held while the scene is read or replaced
         self._placed: Placed | None = None
         self._view: CameraView | None = None
@@ -55,7 +48,7 @@ class Page:
     @property
     def address(self) -> str:
         """The page's URL."""
-        return f"http://{HOST}:{self._server.get_port()}"
+        return self._server.address
 
     def show(self, scene: Sequence[Hypotheses], view: CameraView | None = None) -> None:
         """Replace what is shown. The box stays where it is, after the first scene; so do all switches.
@@ -89,8 +82,7 @@ class Page:
         """End the page."""
         with self._lock:
             self._shown += 1  # next views that are still being found are not drawn
-        with _quiet():
-            self._server.stop()
+        self._server.stop()
 
     def __enter__(self) -> "Page":
         return self
@@ -317,26 +309,3 @@ class Page:
         ends = np.array([[[0.0, 0.0, 0.73 * reach], [0.0, 0.0, 0.81 * reach]]])
         scene.add_arrows(f"{node}/arrow", ends, colour, shaft_radius=0.001, head_radius=0.003, head_length=0.009)
         scene.add_label(f"{node}/rank", text, position=(0.0, 0.0, 0.72 * reach), anchor="bottom-center")
-
-
-def _serve(port: int) -> viser.ViserServer:
-    """viser on exactly this port: by itself it would take the next free one, and say so at length."""
-    if not 0 <= port <= 65535:
-        raise ValueError(f"port {port} does not exist; give one of 0 to 65535")
-    try:
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((HOST, port))
-    except OSError as error:
-        reason = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be opened ({error.strerror})"
-        raise OSError(f"port {port} of {HOST} {reason}; give another, or 0 for a free one") from None
-    with _quiet():
-        server = _Loopback(host=HOST, port=port, verbose=False)
-    return server
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """viser prints panels when it starts and stops."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield

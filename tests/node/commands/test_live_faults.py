@@ -158,6 +158,7 @@ def test_ctrl_c_while_it_compiles_ends_with_its_code(how: signal.Signals, tmp_pa
         ("controller: {infer: {lattice: 0}}", "lattice 0 must be 1 or more"),
         ("controller: {infer: {wall_sigma: 0}}", "wall_sigma 0 and"),
         ("track: {views: 0}", "views 0 and checked 32"),
+        ("token: true", "a token is in the page's address; give the page's port, too"),
     ],
 )
 def test_numbers_that_nothing_can_be_inferred_with_are_refused(key: str, says: str, tmp_path: Path) -> None:

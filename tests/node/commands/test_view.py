@@ -6,6 +6,7 @@ import threading
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from urllib.error import HTTPError
 from urllib.request import urlopen
 
 import cv2
@@ -15,7 +16,8 @@ import pytest
 
 import node.commands.replay
 from node.__main__ import main
-from node.viewer.page import HOST, Page
+from node.viewer.page import Page
+from node.viewer.page_guard import HOST
 from node.viewer.scene3d import camera_view
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.hypotheses_file import load_scene, save
@@ -25,11 +27,8 @@ from perception.sources.frame import Frame
 from perception.sources.frame_folder import read_frame_folder, write_frame_folder
 from probnerf.prior.checkpoint import save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
+from tests.node.browser import CHROMIUM, FLAGS, needs_browser
 from tests.node.mugs import mug_hypotheses, table_frame, write_folder
-
-CHROMIUM = Path("/usr/bin/chromium")
-FLAGS = """--no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run
---disable-background-networking --disable-component-update --disable-sync""".split()
 
 
 @pytest.fixture(scope="module")
@@ -113,19 +112,25 @@ def test_a_frame_that_is_not_the_objects_is_left_out(
     assert note.startswith("note: the picture is left out: ") and says in note and drawn == [(None, None)]
 
 
+@pytest.mark.parametrize("token", [[], ["--token"]])
 def test_view_opens_the_page_until_ctrl_c(
-    results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    results: Path, token: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     loaded: list[bytes] = []
 
     class Interrupted:
         def wait(self) -> None:
-            address = re.search(rf"http://{HOST}:\d+", capsys.readouterr().out)[0]
+            address, path = re.search(rf"(http://{HOST}:\d+)(\S*) shows it", capsys.readouterr().out).groups()
+            assert bool(path) == bool(token)
+            if token:
+                with pytest.raises(HTTPError, match="403"):
+                    urlopen(address, timeout=20)
+            address += path
             loaded.append(urlopen(address, timeout=20).read())
             raise KeyboardInterrupt
 
     monkeypatch.setattr("node.commands.view.threading", SimpleNamespace(Event=Interrupted))
-    assert main(["view", str(results), "--port", "0"]) == 0
+    assert main(["view", str(results), "--port", "0", *token]) == 0
     assert b"<html" in loaded[0]
     assert sorted(p.name for p in results.iterdir()) == ["frame", "object_1.npz", "object_2.npz"]  # nothing is drawn
 
@@ -162,7 +167,7 @@ def test_the_page_listens_on_this_machine_alone_and_shows_from_any_thread(frame:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not CHROMIUM.exists(), reason=f"{CHROMIUM} is not installed: the page needs a browser")
+@needs_browser
 def test_the_page_answers_in_a_browser(frame: Frame, mug: Hypotheses) -> None:
     """It loads nothing from elsewhere; stepping shows another mesh; dragging the box's arrow asks anew."""
     from playwright.sync_api import expect, sync_playwright
