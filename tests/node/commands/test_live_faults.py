@@ -75,8 +75,8 @@ def test_a_page_that_fails_ends_no_inference(
 
     def infer(self: Tracker, look: Any, *, on_answer: Any, **_: Any) -> Update:
         h = replace(body_with_handle(), object_id=look.object_id)
-        for _ in range(3):
-            on_answer(h)
+        for again in (h, h, h):
+            on_answer(again)
         return Update("new", h, 1, 0.0, 0.0)
 
     monkeypatch.setattr(Page, "show", fail)

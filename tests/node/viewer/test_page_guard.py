@@ -10,11 +10,13 @@ import pytest
 import viser
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
+from websockets.sync.connection import Connection
+from websockets.typing import Subprotocol
 
 from node.viewer import page_guard
 from node.viewer.page_guard import CLIENTS, HEADERS, HOST, GuardedServer
 
-VERSION = f"viser-v{viser.__version__}"
+VERSION = Subprotocol(f"viser-v{viser.__version__}")
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +54,7 @@ def response(
             return answer.status, answer.headers, answer.read()
 
 
-def holds_scene(client: ClientConnection) -> bool:
+def holds_scene(client: Connection) -> bool:
     """The scene comes."""
     return any(len(client.recv(timeout=3)) > 12_000 for _ in range(20))
 
@@ -197,14 +199,14 @@ def test_garbage_for_a_message_ends_that_client_alone(
     with opened(server, None) as client:  # what is no value of a camera breaks a task, and not the connection
         client.send(packed(type="ViewerCameraMessage", **dict.fromkeys(CAMERA, "x")))
         assert holds_scene(client)
-    with connect(server.address.replace("http", "ws"), subprotocols=["viser-v0.0.1"], proxy=None) as old:
+    with connect(server.address.replace("http", "ws"), subprotocols=[Subprotocol("viser-v0.0.1")], proxy=None) as old:
         with pytest.raises(ConnectionClosed, match="another version"):
             old.recv(timeout=20)
     assert capfd.readouterr() == ("", "") and not caplog.records
 
 
 def test_a_crowd_is_limited(server: GuardedServer) -> None:
-    clients = []
+    clients: list[ClientConnection] = []
     try:
         for _ in range(100):
             try:
@@ -217,11 +219,11 @@ def test_a_crowd_is_limited(server: GuardedServer) -> None:
     finally:
         for client in clients:
             client.close()
-    with opened(server, None) as client:
-        assert holds_scene(client)
+    with opened(server, None) as later:
+        assert holds_scene(later)
 
 
-def test_with_a_token_only_its_address_answers(capfd: pytest.CaptureFixture) -> None:
+def test_with_a_token_only_its_address_answers() -> None:
     server, other = GuardedServer(0, token=True), GuardedServer(0, token=True)
     try:
         path, strange = server.address.split("/", 3)[3], other.address.split("/", 3)[3]
