@@ -85,8 +85,8 @@ def smc_finds_evidence_and_moments(smc: ModuleType) -> None:
     """Evidence ratios of independent runs average 1 (SMC is unbiased), and their means are the posterior's."""
     args, mean, covariance, evidence = problem()
     whiten = np.linalg.cholesky(np.linalg.inv(covariance))
-    config = tempered_smc.TemperedSMCConfig(populations=16, particles=48, start_particles=96, evidence_power=0.0)
-    posterior = tempered_smc.tempered_smc(jax.random.key(0), linear, args, DIM, config)
+    config = smc.TemperedSMCConfig(populations=16, particles=48, start_particles=96, evidence_power=0.0)
+    posterior = smc.tempered_smc(jax.random.key(0), linear, args, DIM, config)
     assert_zero(np.exp(np.asarray(posterior.diagnostics.log_evidences, np.float64) - evidence) - 1.0)
     z = (np.asarray(posterior.positions, np.float64) - mean) @ whiten
     groups = np.stack([z[np.asarray(posterior.population) == p] for p in range(16)])
@@ -97,7 +97,7 @@ def smc_finds_evidence_and_moments(smc: ModuleType) -> None:
 def smc_takes_proposals_for_what_they_are(smc: ModuleType) -> None:
     """Starts from a density that is off leave the evidence unbiased."""
     args, mean, _, evidence = problem()
-    config = tempered_smc.TemperedSMCConfig(populations=16, particles=48, start_particles=192, evidence_power=0.0)
+    config = smc.TemperedSMCConfig(populations=16, particles=48, start_particles=192, evidence_power=0.0)
     shape = (16, 192, DIM)
     a, b = jax.random.split(jax.random.key(3))
     x = jax.random.normal(a, shape)
@@ -108,7 +108,7 @@ def smc_takes_proposals_for_what_they_are(smc: ModuleType) -> None:
         return -0.5 * jnp.sum(x**2 + jnp.log(2 * jnp.pi), axis=-1)
 
     log_q = jnp.logaddexp(log_normal(q), log_normal((q - centre) / 0.8) - DIM * np.log(0.8)) + np.log(0.5)
-    posterior = tempered_smc.tempered_smc(jax.random.key(0), linear, args, DIM, config, initial=(q, log_q))
+    posterior = smc.tempered_smc(jax.random.key(0), linear, args, DIM, config, initial=(q, log_q))
     assert_zero(np.exp(np.asarray(posterior.diagnostics.log_evidences, np.float64) - evidence) - 1.0)
 
 
@@ -155,9 +155,9 @@ def hmc_leaves_a_target_between_reference_and_posterior_alone(hmc: ModuleType) -
 def smc_finds_the_same_from_any_reference(smc: ModuleType) -> None:
     """From a mixture that is off the evidence is unbiased, and the means are the posterior's."""
     args, mean, covariance, evidence = problem()
-    config = tempered_smc.TemperedSMCConfig(populations=16, particles=48, start_particles=96, evidence_power=0.0)
+    config = smc.TemperedSMCConfig(populations=16, particles=48, start_particles=96, evidence_power=0.0)
     reference = reference_for(mean, covariance)
-    posterior = tempered_smc.tempered_smc(jax.random.key(0), linear, args, DIM, config, reference=reference)
+    posterior = smc.tempered_smc(jax.random.key(0), linear, args, DIM, config, reference=reference)
     if int(posterior.diagnostics.stages) < config.final_stages + 2:  # or no stage's weights are needed
         raise RuntimeError("the law asks nothing of this sampler: the first step reached the posterior")
     assert_zero(np.exp(np.asarray(posterior.diagnostics.log_evidences, np.float64) - evidence) - 1.0)

@@ -54,7 +54,7 @@ def _tracker(monkeypatch: pytest.MonkeyPatch, outcome: str | Exception, then: st
 
     monkeypatch.setattr(Tracker, "infer", infer_look)
     monkeypatch.setattr(Tracker, "look", look)
-    monkeypatch.setattr("perception.inference.warm_up.infer", inference)
+    monkeypatch.setattr("perception.inference.warm_up.infer", infer)
     return Tracker(Prior(ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {}, "x"), seed=3), asked
 
 
