@@ -9,13 +9,13 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
-from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import tyro
 from rich.console import Console
 
 from node.options import Calibrate, Capture, Live, Query, Record, Replay, View
+from probnerf.environment import prepare
 
 Options = TypeVar("Options")
 
@@ -199,16 +199,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _end(main(sys.argv[1:]))
     given = list(argv)
     args = [a for a in given if a != "--debug"]
-    # Compiled programs outlive the process: `probnerf.compile_cache` keeps the large ones, JAX the small ones. JAX
-    # reads these variables when it is first imported.
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "farside"
-    os.environ.setdefault("FARSIDE_PROGRAMS", str(cache))
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    # Only what is fatal: jaxlib 0.10.1 takes its own kept programs for another machine's, at every start.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    # One device per core, to share particles out; a power of two divides their number.
-    os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(1 << min((os.cpu_count() or 1).bit_length() - 1, 4)))
+    prepare()
     if not args or args[0] not in COMMANDS:
         stubs = {name: _documented(name, text) for name, text in SUMMARIES.items()}
         tyro.extras.subcommand_cli_from_dict(

@@ -29,7 +29,7 @@ import numpy as np
 from jax.experimental import serialize_executable
 
 from probnerf.kernel import library
-from probnerf.kernel.build import LIBRARY
+from probnerf.kernel.build import library_path
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -198,7 +198,7 @@ def _environment() -> str:
     """A digest of all that makes another program of the same function and arguments."""
     package = Path(__file__).parent
     source = hashlib.sha256()
-    for path in [*sorted(package.rglob("*.py")), LIBRARY]:
+    for path in [*sorted(package.rglob("*.py")), library_path()]:
         source.update(path.read_bytes() if path.is_file() else b"none")
     settings = sorted((k, repr(v)) for k, v in jax.config.values.items() if "cache" not in k)
     switches = sorted((k, v) for k, v in os.environ.items() if k.startswith(("XLA_", "FARSIDE_KERNEL")))

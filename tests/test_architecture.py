@@ -38,7 +38,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("coverage",),
     ),
     "probnerf": (
-        ("geometry", "types"),
+        ("environment", "geometry", "types"),
         ("kernel",),
         ("compile_cache", "fields"),
         ("rendering",),

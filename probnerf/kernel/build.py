@@ -1,17 +1,27 @@
-"""Compile the kernel with the machine's C++ compiler: `python -m probnerf.kernel.build`. Without one, say so."""
+"""Compile the kernel with the machine's C++ compiler, once: `python -m probnerf.kernel.build`. Without one, say so.
 
+The sources travel with the package. The library lies in the user's cache folder under a digest of all that it is made
+from, so that a checkout, an installed package and several versions of both stand beside each other.
+"""
+
+import fcntl
+import hashlib
 import os
 import platform
 import shutil
 import subprocess
 import sys
+import tempfile
+from functools import cache
 from pathlib import Path
 
 import jax
 
-FOLDER = Path(__file__).resolve().parent
-LIBRARY = FOLDER / "farside_kernel.so"
+from probnerf.environment import cache_folder
+
+SOURCES = Path(__file__).resolve().parent
 COMPILERS = ("c++", "g++", "clang++")
+OPTIONS = ("-std=c++17", "-O3", "-fPIC", "-fno-math-errno")
 # Floats in a vector, points of a tile, and the compiler's options, by instruction set.
 PLAIN: dict[str, tuple[int, int, list[str]]] = {"plain": (4, 64, [])}
 X86: dict[str, tuple[int, int, list[str]]] = {
@@ -25,38 +35,76 @@ def compiler() -> str | None:
     return next((found for name in (os.environ.get("CXX"), *COMPILERS) if name and (found := shutil.which(name))), None)
 
 
-def build() -> bool:
-    """Write `LIBRARY`; False where there is no compiler, or where it fails (what it said goes to standard error)."""
-    cxx = compiler()
-    if cxx is None:
-        print("no C++ compiler found: Farside runs on JAX alone, several times slower", file=sys.stderr)
-        return False
-    common = [cxx, "-std=c++17", "-O3", "-fPIC", "-fno-math-errno", "-isystem", jax.ffi.include_dir()]
+@cache
+def library_path() -> Path:
+    """Where the built library belongs."""
+    digest = hashlib.sha256(repr((OPTIONS, PLAIN, X86, jax.__version__, platform.machine())).encode())
+    for path in sorted([*SOURCES.glob("*.cc"), *SOURCES.glob("*.h")]):
+        digest.update(path.name.encode() + path.read_bytes())
+    return cache_folder() / f"kernel-{digest.hexdigest()[:16]}" / "farside_kernel.so"
+
+
+def built_library() -> Path | None:
+    """The library, built if it is not there yet; None where that failed or nothing can build it.
+
+    What failed once is not tried again until `failed.txt`, which holds the compiler's words, is removed.
+    """
+    path = library_path()
+    if path.is_file():
+        return path
+    failure = path.with_name("failed.txt")
+    if failure.is_file() or (cxx := compiler()) is None:
+        return None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.with_name("lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # two processes that start at once build it once
+            if not path.is_file() and not failure.is_file():
+                print("farside: building the kernel, once; this takes some seconds", file=sys.stderr)
+                if complaint := _build(cxx, path):
+                    failure.write_text(complaint)
+    except OSError as error:  # a full or read-only disk costs speed, and no answer
+        print(f"farside: the kernel cannot be kept in {path.parent} ({error.strerror or error})", file=sys.stderr)
+    return path if path.is_file() else None
+
+
+def _build(cxx: str, path: Path) -> str:
+    """Write the library; what the compiler said where it failed, else ""."""
     sets = PLAIN | (X86 if platform.machine() in ("x86_64", "AMD64") else {})
-    runs, objects = [], []
+    with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+        runs, objects = [], []
 
-    def compile_(source: str, name: str, options: list[str]) -> None:
-        objects.append(LIBRARY.with_suffix(f".{name}.{source}.o"))
-        runs.append([*common, *options, "-c", str(FOLDER / f"{source}.cc"), "-o", str(objects[-1])])
+        def compile_(source: str, name: str, options: list[str]) -> None:
+            objects.append(f"{scratch}/{name}.{source}.o")
+            include = ["-isystem", jax.ffi.include_dir()]
+            runs.append([cxx, *OPTIONS, *include, *options, "-c", str(SOURCES / f"{source}.cc"), "-o", objects[-1]])
 
-    for name, (lanes, tile, options) in sets.items():
-        sizes = [f"-DFARSIDE_ISA={name}", f"-DFARSIDE_LANES={lanes}", f"-DFARSIDE_TILE={tile}"]
-        for source in ("view", "points"):
-            compile_(source, name, [*options, *sizes])
-    compile_("binding", "all", [])
-    started = [subprocess.Popen(run) for run in runs]
-    failed = any([process.wait() for process in started])
-    made = LIBRARY.with_suffix(".tmp")
-    failed = failed or subprocess.run([cxx, "-shared", "-pthread", *map(str, objects), "-o", str(made)]).returncode != 0
-    for path in objects:
-        path.unlink(missing_ok=True)
-    if failed:
-        LIBRARY.unlink(missing_ok=True)  # an older one may not fit the Python beside it
-        print(f"{cxx} could not build the kernel: Farside runs on JAX alone, several times slower", file=sys.stderr)
-        return False
-    os.replace(made, LIBRARY)
-    return True
+        for name, (lanes, tile, options) in sets.items():
+            sizes = [f"-DFARSIDE_ISA={name}", f"-DFARSIDE_LANES={lanes}", f"-DFARSIDE_TILE={tile}"]
+            for source in ("view", "points"):
+                compile_(source, name, [*options, *sizes])
+        compile_("binding", "all", [])
+        started = [subprocess.Popen(run, stderr=subprocess.PIPE, text=True) for run in runs]
+        ended = [(process.communicate()[1], process.returncode) for process in started]
+        complaint = "\n".join(errors or cxx for errors, code in ended if code != 0)
+        if not complaint:
+            link = [cxx, "-shared", "-pthread", *objects, "-o", f"{scratch}/linked.so"]
+            linked = subprocess.run(link, capture_output=True, text=True)
+            complaint = (linked.stderr or cxx) if linked.returncode != 0 else ""
+        if not complaint:
+            os.replace(f"{scratch}/linked.so", path)
+    return complaint
+
+
+def main() -> None:
+    """Build, and say where it is or what is missing."""
+    library_path().with_name("failed.txt").unlink(missing_ok=True)
+    if built_library() is not None:
+        return
+    failure = library_path().with_name("failed.txt")
+    why = f"{compiler()} could not build the kernel ({failure})" if failure.is_file() else "no C++ compiler found"
+    print(f"{why}: Farside runs on JAX alone, several times slower", file=sys.stderr)
 
 
 if __name__ == "__main__":
-    build()
+    main()

@@ -6,17 +6,20 @@ from functools import cache
 
 import jax
 
-from probnerf.kernel.build import LIBRARY
+from probnerf.kernel.build import built_library
 
 VIEW_TERMS, DENSITY = "farside_view_terms", "farside_density"
 
 
 @cache
 def available() -> bool:
-    """Whether the kernel was built and JAX runs on the CPU; `FARSIDE_KERNEL=0` says no."""
-    if os.environ.get("FARSIDE_KERNEL") == "0" or not LIBRARY.is_file() or jax.default_backend() != "cpu":
+    """Whether JAX runs on the CPU and the kernel is built, which the first call does; `FARSIDE_KERNEL=0` says no."""
+    if os.environ.get("FARSIDE_KERNEL") == "0" or jax.default_backend() != "cpu":
         return False
-    library = ctypes.CDLL(str(LIBRARY))
+    path = built_library()
+    if path is None:
+        return False
+    library = ctypes.CDLL(str(path))
     for target, function in ((VIEW_TERMS, library.FarsideViewTerms), (DENSITY, library.FarsideDensity)):
         jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(function), platform="cpu")
     return True

@@ -1,0 +1,24 @@
+"""Where compiled code is kept between processes, and what has to be set before JAX is imported. Imports no JAX."""
+
+import os
+from pathlib import Path
+
+
+def cache_folder() -> Path:
+    """`farside` in the user's cache folder."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "farside"
+
+
+def prepare() -> None:
+    """Set the variables of this process that JAX reads when it is first imported; what is set already stays.
+
+    Compiled programs outlive the process: `probnerf.compile_cache` keeps the large ones, JAX the small ones.
+    """
+    cache = str(cache_folder())
+    os.environ.setdefault("FARSIDE_PROGRAMS", cache)
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", cache)
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    # Only fatal messages: jaxlib 0.10.1 takes its own kept programs for another machine's, at every start.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    # One device per core, to share particles out; a power of two divides their number.
+    os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(1 << min((os.cpu_count() or 1).bit_length() - 1, 4)))
