@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
+from importlib.metadata import version
 from typing import Any, NoReturn, TypeVar
 
 import tyro
@@ -20,7 +21,8 @@ from probnerf.environment import prepare
 Options = TypeVar("Options")
 
 DESCRIPTION = """Farside: from one partial RGB-D view of an object, several whole, weighted shapes, and the probability
-that any space the camera cannot see is occupied. Lengths are in metres. With --debug an error shows its traceback."""
+that any space the camera cannot see is occupied. Lengths are in metres. --version prints the version; with --debug an
+error shows its traceback."""
 
 BENCH = "Run a study: print its table, draw its picture, and write its rows as JSON. Needs a checkout."
 TRAIN = "Train a prior on procedural tabletop objects, or on pictures of your own; resumes by itself after a stop."
@@ -200,6 +202,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = list(argv)
     args = [a for a in given if a != "--debug"]
     prepare()
+    if args == ["--version"]:
+        print(f"farside {version('farside')}")
+        return 0
     if not args or args[0] not in COMMANDS:
         stubs = {name: _documented(name, text) for name, text in SUMMARIES.items()}
         tyro.extras.subcommand_cli_from_dict(

@@ -23,7 +23,7 @@ from perception.observation.segmentation import Segment, SegmentConfig, segment
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import write_frame_folder
 from perception.sources.open_source import SHIPPED_LOG
-from perception.sources.playback import open_playback
+from perception.sources.playback import frame_at
 from perception.sources.topics import TopicNames
 from probnerf.inference import Method
 from probnerf.prior.checkpoint import Prior, load_prior
@@ -159,20 +159,9 @@ def read_frame(
 
     Its notes go to `err`. Raises ValueError where there is none.
     """
-    opened = open_playback(source, start_s=start_s, end_s=end_s, camera=camera, topics=topics)
-    frame, count = None, 0
-    for count, frame in enumerate(opened, start=1):  # noqa: B007
-        if count == index + 1:
-            break
-    for note in opened.notes:
+    frame, notes = frame_at(source, index, start_s, end_s, camera, topics)
+    for note in notes:
         err.print(f"note: {note}", highlight=False, soft_wrap=True)
-    if frame is None:
-        raise ValueError(f"{source or SHIPPED_LOG} has no frame; record it again")
-    if index not in (-1, count - 1):
-        raise ValueError(
-            f"{source or SHIPPED_LOG} has {count} frames{' in this range' if start_s or end_s is not None else ''},"
-            f" no number {index}; give --frame 0 to {count - 1}"
-        )
     return frame
 
 

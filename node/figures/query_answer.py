@@ -9,7 +9,6 @@ from rich.table import Table
 from perception.answers.hypotheses import FrameName, Hypotheses
 from perception.answers.query import QueryResult, query
 from perception.answers.regions import Region
-from perception.answers.verdict import verdict
 
 CM3 = 1e6  # per cubic metre
 SHOWN = 100  # points, each on a line
@@ -23,7 +22,7 @@ def answer(
     Raises ValueError in one line.
     """
     result = query(scene, region, frame)
-    said = verdict(result, risk)
+    said = result.verdict(risk)
     if as_json:
         told = {"verdict": said, "risk": risk, **result.as_dict()}
         out.print(json.dumps(told, indent=1), highlight=False, soft_wrap=True, markup=False)

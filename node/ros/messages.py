@@ -21,7 +21,10 @@ from perception.answers.hypotheses import Hypotheses
 from perception.observation.object_frame import ObjectFrame
 from perception.sources.frame import Frame
 
-FOLDER = Path(__file__).resolve().parents[2] / "launch" / "farside_msgs"
+_HERE = Path(__file__).resolve()
+# Installed they lie inside this package, in a checkout where a ROS workspace takes them from.
+_PLACES = (_HERE.parents[1] / "farside_msgs", _HERE.parents[2] / "launch" / "farside_msgs")
+FOLDER = next((folder for folder in _PLACES if folder.is_dir()), _PLACES[0])
 HYPOTHESES = "farside_msgs/msg/ShapeHypotheses"
 QUERY_REGION = "farside_msgs/srv/QueryRegion"
 NEXT_VIEW = "farside_msgs/srv/NextView"
@@ -51,7 +54,7 @@ def types() -> Typestore:
     store = get_typestore(Stores.ROS2_JAZZY)
     store.fielddefs = _mended(store.fielddefs)
     if not (FOLDER / "package.xml").is_file():
-        raise FileNotFoundError(f"{FOLDER} is missing; run from a checkout of the repository")
+        raise FileNotFoundError(f"{FOLDER} is missing; install Farside again")
     for path in sorted(FOLDER.glob("msg/*.msg")):
         _register(store, f"{FOLDER.name}/msg/{path.stem}", path.read_text(encoding="utf-8"))
     for name, text in PARAMETER_SERVICES.items():

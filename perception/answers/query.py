@@ -8,6 +8,7 @@ of each, and the probability that a region is free of all is the product over *o
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -16,6 +17,8 @@ from perception.answers.hypotheses import FrameName, Hypotheses, binary_entropy
 from perception.answers.regions import Cells, Points, Region, Swept
 from probnerf.rendering.occupancy import voxel_centres
 from probnerf.types import BASE_Z
+
+Verdict = Literal["free", "occupied", "unsure"]
 
 # Weight of "all that was not seen is occupied" beside the hypotheses of an object that its prior cannot explain.
 CAUTION = 0.5
@@ -44,6 +47,20 @@ class QueryResult:
     # disagree with the rest
     blocked_by: dict[int, list[int]] = field(default_factory=dict)
     p_occupied: list[float] | None = None  # of each point; None for a box
+
+    def verdict(self, risk: float = 0.05) -> Verdict:
+        """Free or occupied where the hypotheses' chance of being wrong is at most `risk` in (0, 0.5), else unsure.
+
+        The chance counts what so few hypotheses can tell: of one object, n effective ones that all agree leave
+        1 / (n + 2) (the rule of succession), so that a risk below that is never answered. Nothing is called free that
+        reaches out of every object's cube, or into the table: nobody looked there. How often such calls are wrong of
+        real unseen space is measured by `farside bench calibration`. Raises ValueError for another risk.
+        """
+        if not 0.0 < risk < 0.5:
+            raise ValueError(f"risk is {risk:g}; give the chance of being wrong that you accept, above 0 and below 0.5")
+        if 1.0 - self.p_free_few <= risk:
+            return "free" if self.outside_fraction == 0.0 else "unsure"
+        return "occupied" if self.p_free_few <= risk else "unsure"
 
     def as_dict(self) -> dict[str, float | dict[str, float] | dict[int, list[int]] | list[float]]:
         """The fields by name, ready for JSON, without `p_occupied` where it is None."""

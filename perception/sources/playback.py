@@ -77,3 +77,29 @@ def open_playback(
     if start_s or end_s is not None:
         raise ValueError(f"{path or SHIPPED_LOG} is no recording; leave --from and --to away")
     return source
+
+
+def frame_at(
+    source: Path | str | None,
+    index: int,
+    start_s: float = 0.0,
+    end_s: float | None = None,
+    camera: Camera | None = None,
+    topics: TopicNames | None = None,
+) -> tuple[Frame, list[str]]:
+    """Frame `index` (-1: the last) of a source, or of a recording's range, and the source's notes until there.
+
+    Raises ValueError where there is none, and what `open_playback` raises.
+    """
+    opened = open_playback(source, start_s=start_s, end_s=end_s, camera=camera, topics=topics)
+    frame, count = None, 0
+    for count, frame in enumerate(opened, start=1):  # noqa: B007
+        if count == index + 1:
+            break
+    name = source or SHIPPED_LOG
+    if frame is None:
+        raise ValueError(" ".join([f"{name} has no frame; record it again", *(f"({note})" for note in opened.notes)]))
+    if index not in (-1, count - 1):
+        within = " in this range" if start_s or end_s is not None else ""
+        raise ValueError(f"{name} has {count} frames{within}, no number {index}; give 0 to {count - 1}")
+    return frame, list(opened.notes)

@@ -7,7 +7,6 @@ import pytest
 
 from perception.answers.query import QueryResult, query
 from perception.answers.regions import Box
-from perception.answers.verdict import verdict
 from tests.perception.answers.test_query import BODY, _fill, _object
 
 
@@ -28,13 +27,13 @@ def _answer(few: float, outside: float = 0.0) -> QueryResult:
     ],
 )
 def test_a_verdict_abstains_where_the_risk_is_larger(few: float, outside: float, risk: float, said: str) -> None:
-    assert verdict(_answer(few, outside), risk) == said
+    assert _answer(few, outside).verdict(risk) == said
 
 
 @pytest.mark.parametrize("risk", [0.0, 0.5, -1.0, float("nan")])
 def test_a_risk_that_is_none_is_refused(risk: float) -> None:
     with pytest.raises(ValueError, match="above 0 and below"):
-        verdict(_answer(0.98), risk)
+        _answer(0.98).verdict(risk)
 
 
 def test_hypotheses_that_all_agree_leave_a_doubt_for_each_object() -> None:
@@ -56,7 +55,7 @@ def test_one_population_that_did_not_fail_is_one_witness() -> None:
     lost = replace(sure, diagnostics={"failed_populations": 3.0})
     free = Box((-0.14, -0.14, 0.1), (-0.1, -0.1, 0.14))
     assert query([lost], free, "object").p_free_few == pytest.approx(2 / 3)
-    assert verdict(query([lost], free, "object"), 0.3) == "unsure"
+    assert query([lost], free, "object").verdict(0.3) == "unsure"
     two = replace(lost, population=np.arange(30, dtype=np.int32) % 2)
     assert query([two], free, "object").p_free_few == query([sure], free, "object").p_free_few > 0.7
 

@@ -1,0 +1,50 @@
+"""What is installed is all that exists, and all that is imported is declared and locked."""
+
+import re
+import sys
+import tomllib
+from functools import cache
+from importlib.metadata import packages_distributions
+
+from tests.test_architecture import MAY_IMPORT, PACKAGES, ROOT, files_of, imports, tree_of
+
+
+@cache
+def project() -> dict:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+def test_installed_packages_are_those_that_exist() -> None:
+    found = {str(path.parent).replace("/", ".") for path in files_of(*PACKAGES)}
+    with_init = {str(path.parent).replace("/", ".") for path in files_of(*PACKAGES) if path.name == "__init__.py"}
+    assert found == with_init, "a folder of Python files has no __init__.py"
+    assert sorted(project()["tool"]["setuptools"]["packages"]) == sorted(with_init | {"node.farside_msgs"})
+    assert all((ROOT / name / "py.typed").is_file() for name in PACKAGES), "a package without py.typed has no types"
+
+
+def names(requirements: list[str]) -> set[str]:
+    """Normalised names of the distributions that requirement lines ask for."""
+    return {re.split(r"[^\w.-]", line)[0].lower().replace("_", "-") for line in requirements}
+
+
+def test_every_imported_library_is_declared() -> None:
+    """What a package imports is a dependency; what only a test imports is one of the `dev` extra."""
+    runtime = names(project()["project"]["dependencies"])
+    developer = runtime | names(project()["project"]["optional-dependencies"]["dev"])
+    distributions = packages_distributions()
+    undeclared = []
+    for folders, declared in ((tuple(MAY_IMPORT), runtime), (("tests",), developer)):
+        for path in files_of(*folders):
+            for library in sorted(imports(path, tree_of(path)) - sys.stdlib_module_names - {*MAY_IMPORT, "tests"}):
+                if not names(distributions.get(library, [library])) & declared:
+                    undeclared.append(f"{path} imports {library}, which pyproject.toml does not declare")
+    assert not undeclared, "\n" + "\n".join(undeclared)
+
+
+def test_lock_has_an_exact_version_of_all_that_is_declared() -> None:
+    lines = (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
+    entries = [line for line in lines if line and not line.startswith((" ", "#"))]
+    assert all(re.match(r"[\w.-]+==[\w.]+( ;.*)? \\$", entry) for entry in entries)  # and no option, no address
+    declared = project()["project"]["dependencies"] + project()["project"]["optional-dependencies"]["dev"]
+    missing = names(declared) - names(entries)
+    assert not missing, f"requirements.lock lacks {', '.join(sorted(missing))}: run `make lock`"
