@@ -5,13 +5,14 @@ PYTHON ?= $(shell for p in python3.11 python3 python3.12 python3.13; do \
 BIN := .venv/bin
 ARGS ?=
 
-.PHONY: help setup run test slow format lock clean
+.PHONY: help setup run test slow smoke format lock clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo 'make run     set up if needed, then replay the recording that ships with the project (ARGS=... adds options)'
 	@echo 'make test    set up if needed, then lint, format check, types and the default tests'
 	@echo 'make slow    the statistical tests of minutes'
+	@echo 'make smoke   build the wheel, install it into an empty environment, and use it there'
 	@echo 'make format  sort imports and format every file'
 	@echo 'make lock    write requirements.lock again (ARGS=--upgrade moves every version)'
 	@echo 'make setup   only set up'
@@ -29,6 +30,9 @@ test: setup
 # pytest answers 5 where no test is marked slow.
 slow: setup
 	$(BIN)/pytest -m slow $(ARGS) || [ $$? -eq 5 ]
+
+smoke: setup
+	.ci/smoke
 
 format: setup
 	$(BIN)/ruff check --fix .
