@@ -148,7 +148,7 @@ def test_a_recording_gives_the_asked_frame(
         assert load(tmp_path / "out" / "object_1.npz").stamp_ns == 10**9 * stamp
     capsys.readouterr()
     assert main([*run, "--frame", "3"]) == 1
-    assert "three.mcap has 3 frames, no number 3; give --frame 0 to 2" in one_line(capsys.readouterr().err)
+    assert "three.mcap has 3 frames, no number 3; give 0 to 2" in one_line(capsys.readouterr().err)
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(log.read_bytes()[: int(0.8 * log.stat().st_size)])
     assert main([*run[:1], str(cut), *run[2:]]) == 0

@@ -136,7 +136,7 @@ def reordered(h: Hypotheses, rng: np.random.Generator) -> tuple[Hypotheses, np.n
 
 def split(h: Hypotheses, rng: np.random.Generator) -> tuple[Hypotheses, np.ndarray]:
     """One hypothesis told as two twins of half its weight."""
-    row = rng.integers(len(h.weights))
+    row = int(rng.integers(len(h.weights)))
     rows = np.append(np.arange(len(h.weights)), row)
     weights = h.weights[rows]
     weights[[row, -1]] *= 0.5

@@ -73,7 +73,7 @@ def test_a_page_that_fails_ends_no_inference(
     def fail(self: Page, scene: Any, view: Any) -> None:
         raise RuntimeError("nothing to draw with")
 
-    def infer(self: Tracker, look: Any, *, on_answer: Any, **_: Any) -> Update:
+    def infer(self: Tracker, look: Any, *, on_answer: Any, **limits: Any) -> Update:
         h = replace(body_with_handle(), object_id=look.object_id)
         for again in (h, h, h):
             on_answer(again)
