@@ -28,14 +28,16 @@ def follow(config: ReplayConfig, out: Console, err: Console) -> bool:
     camera = None if config.camera is None else read_camera(config.camera)
     playback = open_playback(config.source, 0.0, config.start_s, config.end_s, camera, config.topics)
     entries = playback.log.schedule() if isinstance(playback, Playback) else []
-    entries = [entry for entry in entries if config.object in (None, entry.object_id)]
-    if not entries:
+    wanted = [entry for entry in entries if config.object in (None, entry.object_id)]
+    if not wanted:
         whose = "" if config.object is None else f" for object {config.object}"
         raise ValueError(f"{path} has no schedule{whose}; leave --schedule away")
     prior = load_prior(config.prior)
     _check(path, entries, prior, config)
+    # Without labels an object's id depends on the objects inferred before, so these are inferred, too.
+    last = max(entry.stamp_ns for entry in wanted)
     by_stamp: dict[int, list[Scheduled]] = {}
-    for entry in entries:
+    for entry in (entry for entry in entries if entry.stamp_ns <= last):
         by_stamp.setdefault(entry.stamp_ns, []).append(entry)
     tracker = Tracker(prior, config.inference, config.track)
     done = same = 0
@@ -50,8 +52,12 @@ def follow(config: ReplayConfig, out: Console, err: Console) -> bool:
                 err.print(f"object {entry.object_id} is not in the frame at {frame.stamp_ns} ns", highlight=False)
                 continue
             found, look = looks[entry.object_id]
+            if entry not in wanted and frame.label is not None:
+                continue
             with progress_of(f"object {entry.object_id}", entry.stages, None, err) as on_stage:
                 update = tracker.infer(look, stages=entry.stages, on_stage=on_stage)
+            if entry not in wanted:
+                continue
             folder = config.folder / str(frame.stamp_ns)
             publish(folder, frame, found, update.hypotheses, update.seconds, out)
             if update.hypotheses.result == "interrupted":

@@ -6,8 +6,10 @@ fields of `Hypotheses` and of its ObjectFrame by their own names; the arrays `op
 gives equal bytes.
 """
 
+import itertools
 import json
 import os
+import re
 import zipfile
 import zlib
 from pathlib import Path
@@ -117,14 +119,21 @@ def load(path: str | Path) -> Hypotheses:
 
 
 def load_scene(path: str | Path) -> list[Hypotheses]:
-    """A hypotheses file, or all objects' files in a folder that `farside replay` wrote, by object id."""
+    """A hypotheses file, or all objects' files (object_<id>.npz) in a folder that `farside replay` wrote, by object id.
+
+    Raises as `load`, and where two files of a folder hold the same object, for then it would be counted twice.
+    """
     path = Path(path)
     if not path.is_dir():
         return [load(path)]
-    files = sorted(path.glob("object_*.npz"))
+    files = sorted(file for file in path.glob("object_*.npz") if re.fullmatch(r"object_\d+\.npz", file.name))
     if not files:
         raise FileNotFoundError(f"{path} holds no object_<id>.npz; give a folder that `farside replay` wrote")
-    return sorted((load(file) for file in files), key=lambda h: h.object_id)
+    scene = sorted((load(file) for file in files), key=lambda h: h.object_id)
+    for h, other in itertools.pairwise(scene):
+        if h.object_id == other.object_id:
+            raise ValueError(f"{path} holds object {h.object_id} in two files; remove the one that is a copy")
+    return scene
 
 
 def _header(path: Path, arrays: dict[str, np.ndarray]) -> dict:
