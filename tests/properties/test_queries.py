@@ -139,7 +139,8 @@ def split(h: Hypotheses, rng: np.random.Generator) -> tuple[Hypotheses, np.ndarr
     row = int(rng.integers(len(h.weights)))
     rows = np.append(np.arange(len(h.weights)), row)
     weights = h.weights[rows]
-    weights[[row, -1]] *= 0.5
+    weights[row] *= 0.5
+    weights[-1] *= 0.5
     return rows_changed(h, rows, weights), rows
 
 
