@@ -41,7 +41,8 @@ from probnerf.prior.encoder_input import ENCODER_RADIUS, camera_features, encode
 from probnerf.prior.networks import ProbNeRF
 from probnerf.rendering import foam
 from probnerf.rendering.occupancy import coarsen, solid
-from probnerf.sampling.ascent import AdamConfig, ascend
+from probnerf.sampling.ascent import ascend
+from probnerf.settings import AdamConfig
 from probnerf.shapes import opacity_grids
 from probnerf.types import FREE, OBJECT, Observation, Rays
 
@@ -70,8 +71,7 @@ class GateConfig:
     @property
     def pictures(self) -> foam.Lattice:
         """Faces of the pictures that are judged, as fine as the voxels: a pixel is half a cube of inference's lattice,
-        through which even the true solid has a ragged outline.
-        """
+        through which even the true solid has a ragged outline."""
         return foam.Lattice(GRID, 1.1, 2 * self.crossings)
 
 

@@ -21,7 +21,8 @@ from benchmarks.harness.progress import say
 from benchmarks.harness.rows import Row
 from benchmarks.scenes.recording import noisy
 from perception.sources.frame import Frame
-from perception.sources.recorder import RecordConfig, Recorder
+from perception.sources.recorder import Recorder
+from perception.sources.settings import RecordConfig
 
 
 @dataclass(frozen=True)

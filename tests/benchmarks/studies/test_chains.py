@@ -11,7 +11,7 @@ import pytest
 from benchmarks.rivals.methods import VI, settings_of
 from benchmarks.studies import chains
 from benchmarks.studies.chains import ANNEALED, COMPARED, CONDITION, FIXED, SMC, main, relative_spread, unexplained
-from perception.inference.controller import ControllerConfig
+from perception.inference.settings import ControllerConfig
 from probnerf.prior.checkpoint import load_prior
 
 
