@@ -36,7 +36,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("coverage",),
     ),
     "probnerf": (
-        ("environment", "geometry", "settings", "types"),
+        ("environment", "geometry", "types"),
         ("kernel",),
         ("compile_cache", "fields"),
         ("rendering",),
@@ -49,7 +49,15 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     "perception": (("sources",), ("observation",), ("answers",), ("inference",), ("simulation",)),
     "node": (("figures", "options"), ("ros", "viewer"), ("commands",), ("__main__",)),
-    "benchmarks": (("harness",), ("scenes",), ("measures",), ("rivals",), ("studies",), ("__main__", "golden")),
+    "benchmarks": (
+        ("harness",),
+        ("scenes",),
+        ("measures",),
+        ("rivals",),
+        ("studies",),
+        ("figures", "golden"),
+        ("__main__",),
+    ),
 }
 
 # An outside library and the files that may import it: one per purpose. `*` also matches folders; tests import freely.

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from perception.inference.settings import ControllerConfig
+from perception.inference.controller import ControllerConfig
 from perception.sources.frame import Frame
-from probnerf.settings import TemperedSMCConfig
+from probnerf.sampling.tempered_smc import TemperedSMCConfig
 
 
 def intrinsics(frame: Frame, amount: float) -> Frame:

@@ -14,8 +14,8 @@ All three on the shipped prior, which was trained through the foam; the paper tr
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,8 @@ from matplotlib.figure import Figure
 
 from benchmarks.harness.intervals import mean_rows
 from benchmarks.harness.progress import say
-from benchmarks.harness.rows import Row
+from benchmarks.harness.study import PriorTableOptions, Summary
+from benchmarks.harness.tables import Table
 from probnerf.geometry import look_at, pinhole_rays
 from probnerf.prior.checkpoint import load_prior
 from probnerf.prior.networks import ProbNeRF
@@ -132,19 +133,22 @@ def view_rays(seed: int, count: int) -> Rays:
     return Rays(jnp.asarray(origin[chosen], jnp.float32), jnp.asarray(direction[chosen], jnp.float32))
 
 
-def main(
-    out: Path, quick: bool = False, prior: Path | None = None, n: int = 3, rays: int = 96, seed: int = 0
-) -> list[Row]:
-    """Acceptance of HMC against its step, with the foam and with quadrature.
+@dataclass(frozen=True)
+class Options(PriorTableOptions):
+    """Acceptance of HMC against its step, with the foam and with quadrature."""
 
-    Args:
-        prior: weights to use; the shipped ones by default
-        n: shapes, each drawn from the prior and seen once
-        rays: pixels of its picture
-        seed: of shapes, views and chains
-    """
-    n, rays, iterations, steps = (1, 32, 3, STEPS[::4]) if quick else (n, rays, ITERATIONS, STEPS)
-    model = load_prior(prior).model
+    n: int = 3
+    """Shapes, each drawn from the prior and seen once."""
+    rays: int = 96
+    """Pixels of its picture."""
+
+
+def main(options: Options) -> Summary:
+    """Measure, and sum up."""
+    n, rays, iterations, steps = (
+        (1, 32, 3, STEPS[::4]) if options.quick else (options.n, options.rays, ITERATIONS, STEPS)
+    )
+    model, seed = load_prior(options.prior).model, options.seed
     found: dict[str, np.ndarray] = {}
     for name in RENDERERS:
         found[name] = np.zeros((n, len(steps)))
@@ -160,11 +164,12 @@ def main(
     for name, values in found.items():
         for step, column in zip(steps, values.T, strict=True):
             rows += mean_rows("acceptance", name, f"step {step:g}", "acceptance", column, "")
-    _draw(found, steps, out / "acceptance.png")
-    return rows
+    cells = [[name, *(f"{mean:.2f}" for mean in values.mean(axis=0))] for name, values in found.items()]
+    table = Table("Acceptance by step", ("renderer", *(f"{step:.2g}" for step in steps)), cells)
+    return Summary(rows, [table], lambda: _draw(found, steps))
 
 
-def _draw(found: dict[str, np.ndarray], steps: tuple[float, ...], path: Path) -> None:
+def _draw(found: dict[str, np.ndarray], steps: tuple[float, ...]) -> Figure:
     figure = Figure(figsize=(6, 4.4), layout="constrained")
     ax = figure.subplots()
     for name, values in found.items():
@@ -172,5 +177,4 @@ def _draw(found: dict[str, np.ndarray], steps: tuple[float, ...], path: Path) ->
         ax.fill_between(steps, values.min(axis=0), values.max(axis=0), color=line.get_color(), alpha=0.15)
     ax.set(xlabel="step", ylabel="acceptance", ylim=(0, 1.02), title="HMC from the true shape (bands: all shapes)")
     ax.legend(fontsize=9)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    return figure

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from subprocess import PIPE
 from typing import Any
@@ -19,11 +20,12 @@ from matplotlib.figure import Figure
 
 from benchmarks.harness.progress import say
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import Summary, TableOptions
 from node.ros.bus import Bus
+from node.ros.bus_config import BusConfig
 from node.ros.messages import QUERY_REGION, header, image_message, make
 from node.ros.parameters import serve_parameters
 from node.ros.services import POINTS, Answers
-from node.ros.settings import BusConfig
 from perception.answers.hypotheses import Hypotheses
 from perception.observation.object_frame import ObjectFrame
 from probnerf.rendering.occupancy import voxel_centres
@@ -35,14 +37,20 @@ _WAIT_S = 30.0
 _FAST = 1e6  # messages per second: no limit
 
 
-def main(out: Path, quick: bool = False, points: int = 1000, hypotheses: int = 48) -> list[Row]:
-    """Times of the bus between two processes on this machine.
+@dataclass(frozen=True)
+class Options(TableOptions):
+    """Times of the bus between two processes on this machine."""
 
-    Args:
-        points: that a query_region request asks about
-        hypotheses: in the scene that is asked, of 64 voxels an axis
-    """
-    trips = 100 if quick else 1000
+    points: int = 1000
+    """That a query_region request asks about."""
+    hypotheses: int = 48
+    """In the scene that is asked, of 64 voxels an axis."""
+
+
+def main(options: Options) -> Summary:
+    """Measure, and sum up."""
+    points, hypotheses = options.points, options.hypotheses
+    trips = 100 if options.quick else 1000
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{s.getsockname()[1]}"
@@ -80,8 +88,7 @@ def main(out: Path, quick: bool = False, points: int = 1000, hypotheses: int = 4
     condition = "640x480 RGB as fast as they go"
     rows.append(Row("bus", "zenoh, tcp", condition, "received", came / seconds, "1/s", came))
     rows.append(Row("bus", "zenoh, tcp", condition, "lost", 1.0 - came / sent, "", sent))
-    _draw(times, out / "bus.png")
-    return rows
+    return Summary(rows, picture=lambda: _draw(times))
 
 
 @contextmanager
@@ -206,7 +213,7 @@ def _until(condition: Callable[[], object]) -> None:
         time.sleep(0.01)
 
 
-def _draw(times: dict[str, Float[np.ndarray, "n"]], path: Path) -> None:
+def _draw(times: dict[str, Float[np.ndarray, "n"]]) -> Figure:
     """Share of the runs that took at most so long."""
     figure = Figure(figsize=(8, 6.5), layout="constrained")
     ax = figure.subplots()
@@ -215,5 +222,4 @@ def _draw(times: dict[str, Float[np.ndarray, "n"]], path: Path) -> None:
     ax.set(xscale="log", xlabel="ms", ylabel="share of runs", title="Bus between two processes, loopback TCP")
     figure.legend(loc="outside lower center")
     ax.grid(alpha=0.3)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    return figure

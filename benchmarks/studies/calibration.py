@@ -13,9 +13,7 @@ cover anything: MAP has none.
 Results are appended to a file, object by object, and what is there is not made again.
 """
 
-from collections.abc import Sequence
-from dataclasses import asdict
-from pathlib import Path
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,10 +21,12 @@ from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchmarks.harness.intervals import mean_rows, paired_interval
-from benchmarks.harness.progress import say, table
-from benchmarks.harness.results import FOLDER, Line, append_line, digest, key, newest, read_lines
+from benchmarks.harness.intervals import Figures, PairedInterval, gap_rows, mean_rows
+from benchmarks.harness.progress import say
+from benchmarks.harness.results import Line, Results, digest, newest, objects_of
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import PriorOptions, Summary, results_of, resumed, selected
+from benchmarks.harness.tables import Table, between, gated, ranged
 from benchmarks.measures.metrics import (
     ECE_BINS,
     best_of_k_iou,
@@ -40,14 +40,13 @@ from benchmarks.measures.metrics import (
 )
 from benchmarks.measures.scores import BOXES, Answer, random_boxes, score
 from benchmarks.rivals.methods import PAPER, VI, Question, answer, settings_of
-from benchmarks.rivals.quick import MAP, METHODS, POSTERIOR, RivalConfig, answers
+from benchmarks.rivals.quick import ENCODER, MAP, METHODS, POSTERIOR, PRIOR, RivalConfig, answers
 from benchmarks.scenes.conditions import ANY, SORTS, views
 from benchmarks.scenes.vessels import VesselView, base_rate
-from perception.inference.settings import ControllerConfig
+from perception.inference.controller import ControllerConfig
 from probnerf.inference import likelihood_settings
-from probnerf.prior.checkpoint import load_prior
+from probnerf.prior.checkpoint import Prior, load_prior
 
-RESULTS = FOLDER / "calibration.jsonl"
 SLOW = {m.name: m for m in (VI, PAPER)}
 PER_OBJECT = {
     "hidden_nll": "nats",
@@ -57,6 +56,7 @@ PER_OBJECT = {
     "energy_score": "",
     "seconds": "s",
 }
+GATE_ECE, GATE_COVERAGE, GATE_WRONG = 0.03, (0.87, 0.93), 0.05  # of the posterior
 RISKS = (0.02, 0.05, 0.1, 0.2)
 COLOURS = dict(
     zip((*METHODS, *SLOW), ("tab:blue", "tab:gray", "tab:orange", "tab:red", "tab:purple", "tab:green"), strict=True)
@@ -88,66 +88,58 @@ def judged(view: VesselView, answer: Answer, rate: Float[np.ndarray, "32 32 32"]
     }
 
 
-def main(
-    out: Path,
-    quick: bool = False,
-    prior: Path | None = None,
-    n: int = 100,
-    slow: int = 24,
-    conditions: str = "",
-    seed: int = 0,
-    results: Path = RESULTS,
-    only_chart: bool = False,
-) -> list[Row]:
-    """Reliability of p_occupied in unseen space, ranks of volumes and scores, beside prior, encoder and MAP.
+@dataclass(frozen=True)
+class Options(PriorOptions):
+    """Reliability of p_occupied in unseen space, ranks of volumes and scores, beside prior, encoder and MAP."""
 
-    Args:
-        prior: weights to use; the shipped ones by default
-        n: objects of each condition
-        slow: of them, those that VI and the paper's annealed HMC answer, too
-        conditions: only these, separated by semicolons: any view; any view, colour only; half hidden; ...
-        seed: of the samplers
-        results: file that results are appended to, and read from
-        only_chart: draw what the file holds
-    """
-    if quick:
-        n, slow, conditions = min(n, 2), 0, conditions or ANY
-        results = out / "calibration.jsonl" if results == RESULTS else results
-    asked = [c.strip() for c in conditions.split(";") if c.strip()] or list(SORTS)
-    if unknown := set(asked) - set(SORTS):
-        raise ValueError(f"no condition {sorted(unknown)}; there are: {'; '.join(SORTS)}")
-    loaded, config, rivals = load_prior(prior), ControllerConfig(), RivalConfig()
-    common = {"prior": loaded.hash, "seed": seed}
-    settings = _settings(config, rivals, quick)
-    if not only_chart:
-        done = {key(line) for line in read_lines(results)}
-        rates = {k: base_rate(128 if quick else 1024, config=config.observe, pose_known=k) for k in (False, True)}
-        for condition, methods, count in ((c, m, k) for c in asked for m, k in ((METHODS, n), (tuple(SLOW), slow))):
+    n: int = 100
+    """Objects of each condition."""
+    slow: int = 24
+    """Of them, those that VI and the paper's annealed HMC answer, too."""
+    conditions: str = ""
+    """Only these, separated by semicolons: any view; any view, colour only; half hidden; ..."""
 
-            def missing(number: int, condition: str = condition, methods: Sequence[str] = methods) -> dict[str, Line]:
-                own = {**common, "condition": condition, "object": number}
-                lines = {m: {**own, "method": m, "settings": settings[m]} for m in methods}
-                return {m: line for m, line in lines.items() if key(line) not in done}
 
-            for number, view in views(condition, min(count, n), lambda number: not missing(number)):
-                if view is None:
-                    continue
-                asked_of = missing(number)
-                given = answers(view, loaded, config, rivals, seed, None, 240, [m for m in asked_of if m in METHODS])
-                question = Question(view, loaded, config, seed)
-                given |= {m: answer(SLOW[m], question)[0] for m in asked_of if m in SLOW}
-                answered = {
-                    m: {**asked_of[m], **judged(view, a, rates[view.pose_known], seed)} for m, a in given.items()
-                }
-                for line in answered.values():
-                    append_line(results, line)
-                say(f"{condition}, {number}: " + ", ".join(f"{m} {v['hidden_nll']:.3f}" for m, v in answered.items()))
-    lines = _answered_by_all([x for x in newest(read_lines(results), loaded.hash, seed) if x["condition"] in asked])
-    if not lines:
-        raise ValueError(f"{results} has no results of this prior and these conditions; leave --only-chart")
-    rows = _rows(lines)
-    _draw(lines, out / "calibration.png")
-    return rows
+def main(options: Options) -> Summary:
+    """Measure what the file lacks, and sum up what it has."""
+    if options.quick:
+        options = replace(options, n=min(options.n, 2), slow=0, conditions=options.conditions or ANY)
+    selected(options.conditions, list(SORTS), "condition")
+    prior, results = load_prior(options.prior), results_of("calibration", options)
+    return resumed(
+        results,
+        options,
+        lambda: _measure(options, prior, results),
+        lambda: summary(newest(results.lines, prior.hash, options.seed), options),
+    )
+
+
+def _measure(options: Options, prior: Prior, results: Results) -> None:
+    config, rivals, seed = ControllerConfig(), RivalConfig(), options.seed
+    common = {"prior": prior.hash, "seed": seed}
+    settings = _settings(config, rivals, options.quick)
+    rates = {k: base_rate(128 if options.quick else 1024, config=config.observe, pose_known=k) for k in (False, True)}
+    asked = selected(options.conditions, list(SORTS), "condition")
+    for condition, methods, count in (
+        (c, m, k) for c in asked for m, k in ((METHODS, options.n), (tuple(SLOW), options.slow))
+    ):
+
+        def missing(number: int, condition: str = condition, methods: tuple[str, ...] = methods) -> dict[str, Line]:
+            own = {**common, "condition": condition, "object": number}
+            lines = {m: {**own, "method": m, "settings": settings[m]} for m in methods}
+            return {m: line for m, line in lines.items() if line not in results}
+
+        for number, view in views(condition, min(count, options.n), lambda number: not missing(number)):
+            if view is None:
+                continue
+            asked_of = missing(number)
+            given = answers(view, prior, config, rivals, seed, None, 240, [m for m in asked_of if m in METHODS])
+            question = Question(view, prior, config, seed)
+            given |= {m: answer(SLOW[m], question)[0] for m in asked_of if m in SLOW}
+            judgements = {m: judged(view, a, rates[view.pose_known], seed) for m, a in given.items()}
+            for method, found in judgements.items():
+                results.add({**asked_of[method], **found})
+            say(f"{condition}, {number}: " + ", ".join(f"{m} {v['hidden_nll']:.3f}" for m, v in judgements.items()))
 
 
 def _answered_by_all(lines: list[Line]) -> list[Line]:
@@ -196,8 +188,18 @@ def called_free(p_free: Float[np.ndarray, "n"], occupied: Bool[np.ndarray, "n"])
     return found
 
 
+def summary(lines: list[Line], options: Options) -> Summary | None:
+    """Figures of the conditions that are asked for; None where there are no rows of them."""
+    asked = selected(options.conditions, list(SORTS), "condition")
+    lines = _answered_by_all([line for line in lines if line["condition"] in asked])
+    if not lines:
+        return None
+    rows = _rows(lines)
+    return Summary(rows, _tables(Figures(rows)), lambda: _draw(lines))
+
+
 def _rows(lines: list[Line]) -> list[Row]:
-    rows, cells = [], []
+    rows = []
     for condition in [c for c in SORTS if any(line["condition"] == c for line in lines)]:
         here = sorted((x for x in lines if x["condition"] == condition), key=lambda x: x["object"])
         by = {m: [x for x in here if x["method"] == m] for m in COLOURS if any(x["method"] == m for x in here)}
@@ -216,34 +218,79 @@ def _rows(lines: list[Line]) -> list[Row]:
                 pooled |= {"coverage90": np.nan, "ks": np.nan}
             pooled |= called_free(p_free, occupied.astype(bool))
             rows += [Row("calibration", method, condition, k, float(v), "", len(own)) for k, v in pooled.items()]
-            gap = paired_interval(*np.array([(x["hidden_nll"], reference[x["object"]]) for x in own]).T)
-            for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
-                rows.append(
-                    Row("calibration", method, condition, f"hidden_nll_above_posterior{label}", value, "nats", gap.n)
-                )
-            mean = {m: float(np.mean([x[m] for x in own])) for m in PER_OBJECT}
-            cells.append([
-                f"{condition} ({len(own)})", method, *(f"{mean[m]:.3f}" for m in PER_OBJECT),
-                f"{ece[0]:.3f} ({ece[1]:.3f}..{ece[2]:.3f})", f"{pooled['coverage90']:.3f}",
-                f"{pooled['falsely_free']:.3f}",
-                f"{pooled['wrong_at_0.05']:.3f} of {pooled['free_at_0.05']:.2f}",
-                "" if method == POSTERIOR else f"{gap.low:+.3f}..{gap.high:+.3f}",
-            ])  # fmt: skip
-    header = (
-        "condition",
-        "method",
-        *PER_OBJECT,
-        "ece, pooled",
-        "coverage90",
-        "falsely_free",
-        "wrong at 0.05",
-        "nll above posterior's",
-    )
-    table("Unseen space", header, cells)
+            both = np.array([(x["hidden_nll"], reference[x["object"]]) for x in own]).T
+            rows += gap_rows("calibration", method, condition, "hidden_nll_above_posterior", *both)
     return rows
 
 
-def _draw(lines: list[Line], path: Path) -> None:
+def _tables(of: Figures) -> list[Table]:
+    """Scores, reliability, whole shapes, and the two slow rivals; gates are the posterior's."""
+    conditions = of.conditions()
+    named = {c: f"{c} ({of.count(c, POSTERIOR, 'hidden_nll')})" for c in conditions}
+    scores, worth, shapes, slow = [], [], [], []
+    for c in conditions:
+        quick = [of.interval(c, m, "hidden_nll_above_posterior") for m in METHODS if m != POSTERIOR]
+        best = min(quick, key=lambda gap: gap.mean)
+        nll = [f"{of(c, m, 'hidden_nll'):.3f}" for m in (POSTERIOR, ENCODER, MAP, PRIOR)]
+        scores.append([named[c], *nll, gated(between(best, sign="+"), best.low, least=0.0)])
+        shown = (POSTERIOR, ENCODER, MAP)
+        shapes.append([
+            named[c], *(" / ".join(f"{of(c, m, k):.{d}f}" for m in shown)
+                        for k, d in (("energy_score", 3), ("best_of_8_iou", 2), ("mean_iou", 2))),
+        ])  # fmt: skip
+        for m in shown if c == ANY else (POSTERIOR,):
+            ece, inside, wrong = (of(c, m, k) for k in ("hidden_ece", "coverage90", "wrong_at_0.05"))
+            ends = PairedInterval(ece, of(c, m, "hidden_ece_q025"), of(c, m, "hidden_ece_q975"), 0)
+            texts = [
+                ranged(ends),
+                "" if np.isnan(inside) else f"{inside:.3f}",
+                f"{wrong:.3f} ({of(c, m, 'free_at_0.05'):.0%})",
+            ]
+            if m == POSTERIOR:
+                gates = ((ece, 0.0, GATE_ECE), (inside, *GATE_COVERAGE), (wrong, 0.0, GATE_WRONG))
+                texts = [gated(text, *gate) for text, gate in zip(texts, gates, strict=True)]
+            worth.append([named[c], m, *texts])
+        for m in [m for m in SLOW if (c, m, "hidden_nll") in of]:
+            gap = of.interval(c, m, "hidden_nll_above_posterior")
+            slow.append([
+                f"{c} ({gap.n})", m, gated(between(gap, sign="+"), gap.low, least=0.0),
+                f"{of(c, m, 'coverage90'):.2f}", f"{of(c, m, 'wrong_at_0.05'):.2f}",
+            ])  # fmt: skip
+    wrong_of = "of boxes called free at a risk of 0.05, those that are not (share called), gate <= 0.05"
+    return [
+        Table(
+            "Means of hidden_nll, nats a voxel; lower is better",
+            ("condition (objects)", *(POSTERIOR, ENCODER, MAP, PRIOR), "best rival less the posterior, gate > 0"),
+            scores,
+        ),
+        Table(
+            "What the probabilities are worth",
+            ("condition (objects)", "method", "hidden_ece, gate <= 0.03", "coverage90, gate 0.87 to 0.93", wrong_of),
+            worth,
+        ),
+        Table(
+            f"Whole shapes: {POSTERIOR} / {ENCODER} / {MAP}",
+            ("condition (objects)", "energy score, lower is better", "best of 8, IoU", "mean IoU"),
+            shapes,
+        ),
+        *(
+            [
+                Table(
+                    "The slow rivals, on the first objects of each condition",
+                    (
+                        "condition (objects)", "method", "hidden_nll above the posterior's, gate > 0", "coverage90",
+                        "called free at 0.05 and not",
+                    ),
+                    slow,
+                )
+            ]
+            if slow
+            else []
+        ),
+    ]  # fmt: skip
+
+
+def _draw(lines: list[Line]) -> Figure:
     """Per condition: reliability of every method; distribution of the posterior's ranks with its band. Three a row."""
     conditions = [c for c in SORTS if any(line["condition"] == c for line in lines)]
     columns, rows = min(3, len(conditions)), -(-len(conditions) // 3)
@@ -255,7 +302,7 @@ def _draw(lines: list[Line], path: Path) -> None:
     for (top, bottom), condition in zip(pairs, conditions, strict=False):
         own = [line for line in lines if line["condition"] == condition]
         _reliability(top, own)
-        objects = len({line["object"] for line in own})
+        objects = len(objects_of(own))
         top.set(title=f"{condition}, {objects} objects", xlabel="p_occupied", ylabel="share occupied")
         ranks = np.concatenate([line["ranks"] for line in own if line["method"] == POSTERIOR])
         at, low, high = uniform_band(objects)  # boxes of one object err together: as if each had one
@@ -265,8 +312,7 @@ def _draw(lines: list[Line], path: Path) -> None:
         bottom.set(xlabel="rank of a box's true volume", ylabel="share below, less uniform", title="ranks, posterior")
         bottom.legend(fontsize=8, loc="upper left")
     axes[0, 0].legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    return figure
 
 
 def _reliability(ax: Axes, lines: list[Line]) -> None:

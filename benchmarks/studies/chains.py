@@ -14,8 +14,7 @@ The views of `farside bench stability`. Per method:
 Answers are appended to a file as they come, and what is there is not made again.
 """
 
-from collections.abc import Sequence
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -23,10 +22,11 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from benchmarks.harness.intervals import interval, mean_rows, paired_interval
-from benchmarks.harness.progress import say, table
-from benchmarks.harness.results import FOLDER, Line, append_line, key, newest, read_lines, refuse_cut
-from benchmarks.harness.rows import Row
+from benchmarks.harness.intervals import Figures, gap_rows, mean_rows
+from benchmarks.harness.progress import say
+from benchmarks.harness.results import Line, Results, newest, refuse_cut
+from benchmarks.harness.study import PriorOptions, Summary, results_of, resumed
+from benchmarks.harness.tables import Table, ranged
 from benchmarks.rivals.methods import (
     METHODS,
     VI,
@@ -40,13 +40,12 @@ from benchmarks.rivals.methods import (
 )
 from benchmarks.scenes.conditions import faultless_pictures
 from benchmarks.scenes.vessels import GRID, vessel_view
-from perception.inference.settings import ControllerConfig
+from perception.inference.controller import ControllerConfig
 from probnerf.inference import without_sizes
 from probnerf.likelihood.dispatch import log_likelihood, plain_log_likelihood
 from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.shapes import explained
 
-RESULTS = FOLDER / "chains.jsonl"
 CONDITION = "any view"
 ROUNDED = 32  # samples whose log-likelihood is evaluated in float64, too
 
@@ -94,66 +93,62 @@ def rounding(question: Question, sampled: Sampled) -> float:
     return float(np.ptp(found - expected))
 
 
-def main(
-    out: Path,
-    quick: bool = False,
-    prior: Path | None = None,
-    n: int = 8,
-    seed: int = 0,
-    results: Path = RESULTS,
-    only_chart: bool = False,
-) -> list[Row]:
-    """Chains that get stuck, draws that collapse, and what float32 costs.
+@dataclass(frozen=True)
+class Options(PriorOptions):
+    """Chains that get stuck, draws that collapse, and what float32 costs."""
 
-    Args:
-        prior: weights to use; the shipped ones by default
-        n: views
-        seed: of the samplers
-        results: file that answers are appended to, and read from
-        only_chart: draw what the file holds
-    """
-    compared: Sequence[Method] = COMPARED
-    if quick:
-        compared, n, results = (SMC,), 1, out / "chains.jsonl" if results == RESULTS else results
-    loaded = load_prior(prior)
-    if not only_chart:
-        _measure(loaded, compared, n, seed, results)
-    lines = newest(read_lines(results), loaded.hash, seed)
-    by = {m.name: [line for line in lines if line["method"] == m.name][:n] for m in compared}
-    if not all(by.values()):
-        raise ValueError(f"{results} has no answers of {', '.join(m for m in by if not by[m])}; leave --only-chart")
-    _draw(by, out / "chains.png")
-    return _rows(by)
+    n: int = 8
+    """Views."""
+
+    @property
+    def compared(self) -> tuple[Method, ...]:
+        """Methods: a quick run asks one."""
+        return (SMC,) if self.quick else COMPARED
 
 
-def _measure(prior: Prior, compared: Sequence[Method], n: int, seed: int, results: Path) -> None:
+def main(options: Options) -> Summary:
+    """Measure what the file lacks, and sum up what it has."""
+    if options.quick:
+        options = replace(options, n=1)
+    prior, results = load_prior(options.prior), results_of("chains", options)
+    return resumed(
+        results,
+        options,
+        lambda: _measure(options, prior, results),
+        lambda: summary(newest(results.lines, prior.hash, options.seed), options),
+    )
+
+
+def _measure(options: Options, prior: Prior, results: Results) -> None:
     config = ControllerConfig()
-    done = {key(line) for line in read_lines(results)}
-    for number, picture in enumerate(faultless_pictures(n), start=1):
+    for number, picture in enumerate(faultless_pictures(options.n), start=1):
         view = vessel_view(picture)
-        common = {"prior": prior.hash, "condition": CONDITION, "object": view.seed, "seed": seed}
-        for method in compared:
+        common = {"prior": prior.hash, "condition": CONDITION, "object": view.seed, "seed": options.seed}
+        for method in options.compared:
             line: Line = {**common, "method": method.name, "settings": settings_of(method, config)}
-            if key(line) in done:
+            if line in results:
                 continue
-            question = Question(view, prior, config, seed)
+            question = Question(view, prior, config, options.seed)
             found, sampled, _ = answer(method, question)
             refuse_cut(found.result)
             volumes = (found.shapes & ~view.seen).reshape(-1, GRID**3).sum(axis=1).astype(np.float64)
-            line["unexplained"] = [round(u, 4) for u in unexplained(question, sampled)]
-            line["volume_sd"] = round(relative_spread(volumes, found.weights), 4)
+            missed = [round(u, 4) for u in unexplained(question, sampled)]
+            line |= {"unexplained": missed, "volume_sd": round(relative_spread(volumes, found.weights), 4)}
             if method is SMC:
                 line["rounding"] = float(f"{rounding(question, sampled):.3g}")
-            append_line(results, line)
-            said = line["unexplained"]
+            results.add(line)
             say(
-                f"view {number} of {n}: {method.name}: unexplained {min(said):.3f} to {max(said):.3f}, hidden volume"
-                f" +- {100 * line['volume_sd']:.0f}%"
+                f"view {number} of {options.n}: {method.name}: unexplained {min(missed):.3f} to {max(missed):.3f},"
+                f" hidden volume +- {line['volume_sd']:.0%}"
             )
 
 
-def _rows(by: dict[str, list[Line]]) -> list[Row]:
-    rows, lines = [], []
+def summary(lines: list[Line], options: Options) -> Summary | None:
+    """Figures of the first `n` views; None where a method has none."""
+    by = {m.name: [line for line in lines if line["method"] == m.name][: options.n] for m in options.compared}
+    if not all(by.values()):
+        return None
+    rows = []
     reference = {line["object"]: line["volume_sd"] for line in by[SMC.name]}
     for name, found in by.items():
         chains = [np.array(line["unexplained"]) for line in found]
@@ -167,21 +162,31 @@ def _rows(by: dict[str, list[Line]]) -> list[Row]:
             values["rounding"] = [line["rounding"] for line in found]
         for metric, each in values.items():
             rows += mean_rows("chains", name, CONDITION, metric, each, "nats" * (metric == "rounding"))
-        common = [line for line in found if line["object"] in reference]
-        gap = paired_interval(
-            np.array([line["volume_sd"] for line in common]), np.array([reference[line["object"]] for line in common])
-        )
-        rows.append(Row("chains", name, CONDITION, "volume_sd_above_smc", gap.mean, "", gap.n))
-        shown = (f"{interval(values[m]).mean:.3f}" for m in values if m != "rounding")
-        lines.append([name, str(len(found)), *shown, f"{gap.mean:+.3f} ({gap.low:+.3f} to {gap.high:+.3f})"])
-    header = ("method", "views", "unexplained", "sd of chains", "worst chain", "volume_sd", "above smc's (95%)")
-    table("Chains and draws, means over views", header, lines)
-    worst = max(line["rounding"] for line in by[SMC.name])
-    say(f"\nfloat32 against float64: differences of log-likelihoods err by at most {worst:.2g} nats")
-    return rows
+        both = [(line["volume_sd"], reference[line["object"]]) for line in found if line["object"] in reference]
+        own, theirs = np.array(both).reshape(-1, 2).T
+        rows += gap_rows("chains", name, CONDITION, "volume_sd_above_smc", own, theirs, unit="")
+    of, worst = Figures(rows), max(line["rounding"] for line in by[SMC.name])
+    metrics = ("unexplained", "unexplained_sd", "unexplained_worst", "volume_sd")
+    cells = [
+        [
+            name, str(len(by[name])), *(f"{of(CONDITION, name, m):.3f}" for m in metrics),
+            ranged(of.interval(CONDITION, name, "volume_sd_above_smc"), sign="+"),
+        ]
+        for name in by
+    ]  # fmt: skip
+    header = ("method", "views", "unexplained", "sd of chains", "worst chain", "volume_sd", "above smc's")
+    tables = [
+        Table("Chains and draws, means over views", header, cells),
+        Table(
+            "The kernel's float32 against float64",
+            ("", "nats"),
+            [["largest error of a difference of two samples' log-likelihoods", f"{worst:.2g}"]],
+        ),
+    ]
+    return Summary(rows, tables, lambda: _draw(by))
 
 
-def _draw(by: dict[str, list[Line]], path: Path) -> None:
+def _draw(by: dict[str, list[Line]]) -> Figure:
     figure = Figure(figsize=(11, 4), layout="constrained")
     stuck, wide = figure.subplots(1, 2)
     colours = ("tab:blue", "tab:orange", "tab:red", "tab:green")
@@ -196,5 +201,4 @@ def _draw(by: dict[str, list[Line]], path: Path) -> None:
     wide.set(title="volume where nobody saw: spread of the draws", xlabel="view", ylabel="standard deviation / mean")
     for ax in (stuck, wide):
         ax.legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    return figure

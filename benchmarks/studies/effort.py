@@ -11,14 +11,15 @@ import resource
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.harness.intervals import interval, mean_rows, paired_interval
-from benchmarks.harness.progress import say, table
+from benchmarks.harness.intervals import gap_rows, interval, mean_rows, paired_interval
+from benchmarks.harness.progress import say
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import PriorTableOptions, Summary
+from benchmarks.harness.tables import Table, between, gated
 from benchmarks.measures.metrics import scored_voxels
 from benchmarks.measures.scores import Answer, random_boxes, score
 from benchmarks.scenes.cartons import carton_seeds, half_hidden
@@ -32,8 +33,7 @@ from benchmarks.scenes.vessels import (
     simulated_camera,
     vessel_view,
 )
-from perception.inference.controller import Estimate, estimate
-from perception.inference.settings import ControllerConfig
+from perception.inference.controller import ControllerConfig, Estimate, estimate
 from perception.simulation.simulated_camera import Placed, Scene, render
 from probnerf.objects.tabletop import KINDS, TEST_SEEDS, TEXTURES
 from probnerf.prior.checkpoint import load_prior
@@ -82,18 +82,20 @@ def _easy(seed: int) -> VesselPicture:
     return VesselPicture(placed, camera, T, render(Scene((placed,)), camera, T))
 
 
-def main(out: Path, quick: bool = False, prior: Path | None = None, n: int = 8, seed: int = 0) -> list[Row]:
-    """What the controller spends on easy and on hard scenes, beside the largest model for all.
+@dataclass(frozen=True)
+class Options(PriorTableOptions):
+    """What the controller spends on easy and on hard scenes, beside the largest model for all."""
 
-    Args:
-        prior: weights to use; the shipped ones by default
-        n: scenes of each sort
-        seed: of the samplers
-    """
-    n = min(n, 2) if quick else n
-    loaded, config = load_prior(prior), ControllerConfig()
+    n: int = 8
+    """Scenes of each sort."""
+
+
+def main(options: Options) -> Summary:
+    """Measure, and sum up."""
+    n, seed = min(options.n, 2) if options.quick else options.n, options.seed
+    loaded, config = load_prior(options.prior), ControllerConfig()
     amounts = {CONTROLLER: config, LARGEST: replace(config, tolerance=0.0)}
-    rate = base_rate(128 if quick else 1024, config=config.observe)
+    rate = base_rate(128 if options.quick else 1024, config=config.observe)
     spent: dict[str, list[Spent]] = {condition: [] for condition in CONDITIONS}
     warm = set[str]()
 
@@ -132,14 +134,13 @@ def main(out: Path, quick: bool = False, prior: Path | None = None, n: int = 8, 
             )
             for line in spent[condition][-1].log:
                 say(f"    {line}")
-    rows = _rows(spent)
+    rows, table = _rows(spent)
     peak = 1e-6 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # kB
     rows.append(Row("effort", "both", "the process", "peak_memory", peak, "GB", 1))
-    _draw(spent, out / "effort.png")
-    return rows
+    return Summary(rows, [table], lambda: _draw(spent))
 
 
-def _rows(spent: dict[str, list[Spent]]) -> list[Row]:
+def _rows(spent: dict[str, list[Spent]]) -> tuple[list[Row], Table]:
     rows, lines, none = [], [], [""] * len(PARTS)
 
     def column(condition: str, method: str, metric: str) -> list[float]:
@@ -151,29 +152,21 @@ def _rows(spent: dict[str, list[Spent]]) -> list[Row]:
                 rows += mean_rows("effort", method, condition, metric, column(condition, method, metric), unit)
             cells = [f"{interval(column(condition, method, metric)).mean:.3g}" for metric in (*METRICS, *PARTS)]
             lines.append([condition, method, *cells])
-        gap = paired_interval(
-            *(np.array(column(condition, method, "hidden_nll")) for method in (CONTROLLER, LARGEST)),
-        )
-        for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
-            rows.append(Row("effort", CONTROLLER, condition, f"nll_above_largest{label}", value, "nats", gap.n))
+        own, largest = (column(condition, method, "hidden_nll") for method in (CONTROLLER, LARGEST))
+        gap = paired_interval(own, largest)
+        rows += gap_rows("effort", CONTROLLER, condition, "nll_above_largest", own, largest)
         lines.append(
-            [
-                condition,
-                "controller's nll above the largest's, 95%",
-                *[""] * 3,
-                f"{gap.low:+.3f} .. {gap.high:+.3f}",
-                *none,
-            ]
+            [condition, "controller's hidden_nll above the largest's", "", "", "", between(gap, sign="+"), *none]
         )
     for metric in ("point_gradients", "seconds"):
         easy, hard = (float(np.mean(column(condition, CONTROLLER, metric))) for condition in CONDITIONS)
         rows.append(Row("effort", CONTROLLER, "easy over hard", metric, easy / hard, "", len(spent[EASY])))
-        lines.append(["easy over hard (aim: 0.2)", metric, f"{easy / hard:.3f}", "", "", "", *none])
-    table("What scenes cost", ("condition", "method", *METRICS, *PARTS), lines)
-    return rows
+        share = gated(f"{easy / hard:.3f}", easy / hard, most=0.2)
+        lines.append(["easy over hard, gate <= 0.2", metric, share, "", "", "", *none])
+    return rows, Table("What scenes cost", ("condition", "method", *METRICS, *PARTS), lines)
 
 
-def _draw(spent: dict[str, list[Spent]], path: Path) -> None:
+def _draw(spent: dict[str, list[Spent]]) -> Figure:
     """Every scene's cost and score, an arrow from the controller to the largest model."""
     figure = Figure(figsize=(8, 5), layout="constrained")
     ax = figure.subplots()
@@ -189,5 +182,4 @@ def _draw(spent: dict[str, list[Spent]], path: Path) -> None:
     ax.set(xscale="log", xlabel="field evaluations with gradient", ylabel="hidden_nll, nats (lower is better)")
     ax.set_title("A line joins one scene's two answers")
     ax.legend(fontsize=9)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    return figure

@@ -30,15 +30,16 @@ from matplotlib.figure import Figure
 from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
-from benchmarks.harness.progress import say, table
+from benchmarks.harness.progress import say
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import PriorTableOptions, Summary
+from benchmarks.harness.tables import Table, gated
 from benchmarks.measures.metrics import hidden_log_score, symmetric_chamfer
 from benchmarks.rivals.quick import warm_up
 from perception.answers.hypotheses import Hypotheses, surface_points
 from perception.answers.query import query
 from perception.answers.regions import Points
-from perception.inference.controller import Estimate, estimate
-from perception.inference.settings import ControllerConfig
+from perception.inference.controller import ControllerConfig, Estimate, estimate
 from perception.observation.segmentation import Segment, segment
 from perception.observation.support_plane import heights
 from perception.sources.frame import Frame
@@ -177,27 +178,24 @@ def _matching(segments: Sequence[Segment], mask: Bool[np.ndarray, "h w"]) -> Seg
     return segments[best] if best >= 0 and overlap[best] >= 0.25 else None
 
 
-def main(
-    out: Path,
-    quick: bool = False,
-    prior: Path | None = None,
-    data: Path = DATA,
-    budget_s: float = 60.0,
-    stages: int = 0,
-    seed: int = 0,
-) -> list[Row]:
-    """A real table (YCB-Video 000002): hypotheses against the true models, label given and not.
+@dataclass(frozen=True)
+class Options(PriorTableOptions):
+    """A real table (YCB-Video 000002): hypotheses against the true models, label given and not."""
 
-    Args:
-        prior: weights to use; the shipped ones by default
-        data: the frame's folder
-        budget_s: seconds that an object may take
-        stages: stages that the sampler may take instead of the budget (0: the budget holds)
-        seed: of the sampler
-    """
+    data: Path = DATA
+    """The frame's folder."""
+    budget_s: float = 60.0
+    """Seconds that an object may take."""
+    stages: int = 0
+    """Stages that the sampler may take instead of the budget (0: the budget holds)."""
+
+
+def main(options: Options) -> Summary:
+    """Measure, and sum up."""
+    data = options.data
     if not (data / "models").is_dir():
         raise FileNotFoundError(f"{data}: no frame with true models there; give its folder with --data")
-    loaded, frame, truth = load_prior(prior), read_frame_folder(data), read_truth(data)
+    loaded, frame, truth = load_prior(options.prior), read_frame_folder(data), read_truth(data)
     judged: list[Judged] = []
     config, sizes = ControllerConfig(), set[tuple[int, ...]]()
     for labelled in (True, False):
@@ -205,19 +203,16 @@ def main(
         given = frame if labelled else replace(frame, label=None)
         segments = segment(given)
         shared = time.monotonic() - begun
-        for object_id in list(OBJECTS)[: 1 if quick else None]:
+        for object_id in list(OBJECTS)[: 1 if options.quick else None]:
             assert frame.label is not None
             chosen = _matching(segments, frame.label == object_id)
             if chosen is None:
                 say(f"object {object_id} ({OBJECTS[object_id]}): not found without its label")
                 continue
             warm_up(given, chosen, loaded, config, sizes)
-            judged.append(
-                _judge(given, chosen, loaded, config, truth, object_id, labelled, shared, budget_s, stages, seed)
-            )
-    _print(judged)
-    _draw(judged, out / "frame.png")
-    return _rows(judged)
+            answered = _judge(given, chosen, loaded, config, truth, object_id, labelled, shared, options)
+            judged.append(answered)
+    return Summary(_rows(judged), [_table(judged)], lambda: _draw(judged))
 
 
 def _judge(
@@ -229,18 +224,16 @@ def _judge(
     object_id: int,
     labelled: bool,
     shared_s: float,
-    budget_s: float,
-    stages: int,
-    seed: int,
+    options: Options,
 ) -> Judged:
     found = estimate(
         frame,
         chosen,
         prior,
         config,
-        seed=seed,
-        budget_s=None if stages else budget_s,
-        stages=stages or None,
+        seed=options.seed,
+        budget_s=None if options.stages else options.budget_s,
+        stages=options.stages or None,
     )
     h = found.hypotheses
     values = measure(h, frame, chosen.plane, truth, object_id)
@@ -265,37 +258,36 @@ def _rows(judged: Sequence[Judged]) -> list[Row]:
     return rows
 
 
-def _print(judged: Sequence[Judged]) -> None:
+def _table(judged: Sequence[Judged]) -> Table:
+    """Gates are of the coffee can and the pitcher."""
     lines = []
     for j in judged:
         v, bound = j.values, CHAMFER_MM.get(j.id)
-        verdict = ""
+        texts = [
+            f"{v['chamfer']:.1f}" + (f" (<= {bound:g})" if bound else ""),
+            f"{v['p_within_one_voxel']:.2f}",
+            f"{v['p_three_voxels_outside']:.3f}",
+            f"{v['log_score']:.3f} ({VPRISM[j.id]:.2f})",
+        ]
         if bound is not None:
-            good = v["chamfer"] <= bound, v["p_within_one_voxel"] >= P_SURFACE, v["p_three_voxels_outside"] <= P_OUTSIDE
-            verdict = " ".join("pass" if g else "FAIL" for g in (*good, v["log_score"] < VPRISM[j.id]))
-        lines.append(
-            (
-                j.condition,
-                f"{v['chamfer']:.1f}" + (f" (<= {bound:g})" if bound else ""),
-                f"{v['p_within_one_voxel']:.2f}",
-                f"{v['p_three_voxels_outside']:.3f}",
-                f"{v['log_score']:.3f}",
-                f"{VPRISM[j.id]:.2f}",
-                f"{v['seconds']:.0f}",
-                j.found.hypotheses.result,
-                verdict,
-            )
-        )
-    header = ("", "Chamfer, mm", f"p at surface (>= {P_SURFACE:g})", f"p outside (<= {P_OUTSIDE:g})", "log score",
-              "mapper's", "s", "stopped", "Chamfer, surface, outside, score")  # fmt: skip
-    table(
-        "YCB-Video 000002; the mapper is V-PRISM (arXiv 2403.08106), run on this frame with true masks", header, lines
-    )
+            texts = [
+                gated(texts[0], v["chamfer"], most=bound),
+                gated(texts[1], v["p_within_one_voxel"], least=P_SURFACE),
+                gated(texts[2], v["p_three_voxels_outside"], most=P_OUTSIDE),
+                gated(texts[3], v["log_score"], most=VPRISM[j.id]),
+            ]
+        lines.append([j.condition, *texts, f"{v['seconds']:.0f}", j.found.hypotheses.result])
+    header = (
+        "object", "Chamfer distance, mm", f"p at the surface, gate >= {P_SURFACE:g}",
+        f"p three voxels outside, gate <= {P_OUTSIDE:g}", "log score (the mapper's, the gate)", "s", "stopped",
+    )  # fmt: skip
+    title = "YCB-Video 000002; the mapper is V-PRISM (arXiv 2403.08106), run on this frame with true masks"
+    return Table(title, header, lines)
 
 
-def _draw(judged: Sequence[Judged], path: Path) -> None:
+def _draw(judged: Sequence[Judged]) -> Figure:
     """Two sections of each object, upright towards the camera and level: p_occupied, shapes' outlines, true points."""
-    figure = Figure(figsize=(14, 3.6 * max(1, -(-len(judged) // 2))), layout="constrained")
+    figure = Figure(figsize=(14, 3.6 * max(1, -(-len(judged) // 2))), layout="constrained", dpi=110)
     axes = figure.subplots(max(1, -(-len(judged) // 2)), 4, squeeze=False)
     for ax in axes.flat:
         ax.set_axis_off()
@@ -322,5 +314,4 @@ def _draw(judged: Sequence[Judged], path: Path) -> None:
     figure.suptitle(
         "p_occupied in two sections (upright: camera on the right), six hypotheses in white, true surface in cyan"
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    return figure

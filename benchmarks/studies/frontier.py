@@ -19,29 +19,29 @@ The first vessels of the test seeds with a handle for which there is a view that
 Results are appended to a file, vessel by vessel, and what is there is not made again: Ctrl-C any time, and go on later.
 """
 
-import json
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from fnmatch import fnmatch
-from pathlib import Path
 
 import numpy as np
 
-from benchmarks.harness.intervals import mean_rows, paired_interval
+from benchmarks.harness.intervals import Figures, gap_rows, mean_rows
 from benchmarks.harness.machine import matrix_speed
-from benchmarks.harness.progress import say, table
-from benchmarks.harness.results import FOLDER, Line, append_line, key, newest, read_lines, refuse_cut
+from benchmarks.harness.progress import say
+from benchmarks.harness.results import Line, Results, newest, objects_of, refuse_cut
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import PriorOptions, Summary, results_of, resumed
+from benchmarks.harness.tables import Table, gated, ranged
 from benchmarks.measures.metrics import coverage, falsely_free, ks_distance, scored_voxels
 from benchmarks.measures.scores import BOXES, picture_psnr, random_boxes, score
 from benchmarks.rivals.methods import CONDITIONS, DEPTHS, FULL, METHODS, Method, Question, answer, settings_of
 from benchmarks.scenes.vessels import base_rate, vessel_picture, vessel_view
 from benchmarks.studies.frontier_chart import draw_frontier
-from perception.inference.settings import ControllerConfig
+from perception.inference.controller import ControllerConfig
 from probnerf.inference import without_sizes
 from probnerf.objects.tabletop import TEST_SEEDS
 from probnerf.prior.checkpoint import Prior, load_prior
 
-RESULTS = FOLDER / "frontier.jsonl"
 UNITS = {
     "hidden_nll": "nats",
     "hidden_nll_handle": "nats",
@@ -58,52 +58,44 @@ OVER_ALL = "over all conditions"
 REFUSED = "perception"  # the method of a line that says why a view is left out
 
 
-def main(
-    out: Path,
-    quick: bool = False,
-    prior: Path | None = None,
-    n: int = 24,
-    methods: str = "",
-    conditions: str = "",
-    seed: int = 0,
-    results: Path = RESULTS,
-    only_chart: bool = False,
-) -> list[Row]:
-    """Accuracy against time on one picture: hidden and informative views, with depth and without.
+@dataclass(frozen=True)
+class Options(PriorOptions):
+    """Accuracy against time on one picture: hidden and informative views, with depth and without."""
 
-    Args:
-        prior: weights to use; the shipped ones by default
-        n: vessels, the first so many
-        methods: only these: names, groups or patterns with *, separated by semicolons
-        conditions: only these: patterns such as hidden*;*RGB-D
-        seed: of the samplers
-        results: file that results are appended to, and read from
-        only_chart: draw what the file holds
-    """
-    if quick:
-        n, methods, conditions = 1, methods or "encoder;map;smc", conditions or CONDITIONS[0]
-        results = out / "frontier.jsonl" if results == RESULTS else results
-    chosen = [m for m in METHODS if _matches((m.name, m.group), methods)]
-    asked = [c for c in CONDITIONS if _matches((c,), conditions)]
-    if not chosen or not asked:
-        names = "; ".join((*(m.name for m in METHODS), *CONDITIONS))
-        raise ValueError(f"no method {methods!r} or condition {conditions!r}; there are: {names}")
-    loaded = load_prior(prior)
-    if not only_chart:
-        try:
-            _measure(loaded, chosen, asked, n, seed, results)
-        except KeyboardInterrupt:
-            say(f"stopped; {results} keeps what is done")
-    lines = newest(read_lines(results), loaded.hash, seed)
-    vessels = sorted({line["object"] for line in lines})[:n]
-    lines = [line for line in lines if line["condition"] in asked and line["object"] in vessels]
-    lines = [line for line in lines if line["method"] in {m.name for m in chosen}]
-    if not lines:
-        raise ValueError(f"{results} has no results of this prior, these methods and conditions; leave --only-chart")
-    rows = _rows(lines)
-    _print(rows)
-    draw_frontier(rows, out / "frontier.png")
-    return rows
+    n: int = 24
+    """Vessels, the first so many."""
+    methods: str = ""
+    """Only these: names, groups or patterns with *, separated by semicolons."""
+    conditions: str = ""
+    """Only these: patterns such as hidden*;*RGB-D."""
+
+    @property
+    def chosen(self) -> tuple[list[Method], list[str]]:
+        """Methods and conditions that are asked for. Raises ValueError where there is none."""
+        methods = [m for m in METHODS if _matches((m.name, m.group), self.methods)]
+        conditions = [c for c in CONDITIONS if _matches((c,), self.conditions)]
+        if not methods or not conditions:
+            names = "; ".join((*(m.name for m in METHODS), *CONDITIONS))
+            raise ValueError(f"no method {self.methods!r} or condition {self.conditions!r}; there are: {names}")
+        return methods, conditions
+
+
+ALSO = (Options(n=48, methods=f"{FULL};smc;controller, 10 stages;smc, 3 runs;smc, 6 runs", conditions=CONDITIONS[0]),)
+
+
+def main(options: Options) -> Summary:
+    """Measure what the file lacks, and sum up what it has."""
+    if options.quick:
+        methods, conditions = options.methods or "encoder;map;smc", options.conditions or CONDITIONS[0]
+        options = replace(options, n=1, methods=methods, conditions=conditions)
+    _ = options.chosen  # a mistyped name is refused before anything is loaded
+    prior, results = load_prior(options.prior), results_of("frontier", options)
+    return resumed(
+        results,
+        options,
+        lambda: _measure(options, prior, results),
+        lambda: summary(newest(results.lines, prior.hash, options.seed), options),
+    )
 
 
 def _matches(names: Sequence[str], patterns: str) -> bool:
@@ -111,24 +103,24 @@ def _matches(names: Sequence[str], patterns: str) -> bool:
     return not asked or any(fnmatch(name, p) for name in names for p in asked)
 
 
-def _measure(prior: Prior, methods: list[Method], conditions: list[str], n: int, seed: int, results: Path) -> None:
+def _measure(options: Options, prior: Prior, results: Results) -> None:
     """Every method on every condition of every vessel that the file lacks, vessel by vessel."""
     config, rate = ControllerConfig(), None
-    done = {key(line) for line in read_lines(results)}
-    known = {json.loads(k[4]) for k in done}
+    methods, conditions = options.chosen
+    known = {line["object"] for line in results.lines}
     warm: set[tuple] = set()
     vessels = 0
     for number in TEST_SEEDS:
-        if vessels == n:
+        if vessels == options.n:
             break
-        common = {"prior": prior.hash, "object": number, "seed": seed}
+        common = {"prior": prior.hash, "object": number, "seed": options.seed}
         asked = [
             {"method": m.name, "settings": settings_of(m, config), "condition": c, **common}
             for c in conditions
             for m in methods
-            if c in m.conditions and key(_refusal(c, common)) not in done
+            if c in m.conditions and _refusal(c, common) not in results
         ]
-        asked = [line for line in asked if key(line) not in done]
+        asked = [line for line in asked if line not in results]
         if not asked and number in known:
             vessels += 1
             continue
@@ -147,12 +139,12 @@ def _measure(prior: Prior, methods: list[Method], conditions: list[str], n: int,
                 view = vessel_view(hidden if handle == "hidden" else informative, depth == DEPTHS[0])
             except ValueError as error:
                 say(f"vessel {number}, {condition}: left out, {error}")
-                append_line(results, {**_refusal(condition, common), "result": str(error)})
+                results.add({**_refusal(condition, common), "result": str(error)})
                 continue
             for line in left:
                 method = next(m for m in methods if m.name == line["method"])
-                found = _one(method, Question(view, prior, config, seed), rate, depth, warm)
-                append_line(results, {**line, **found})
+                found = _one(method, Question(view, prior, config, options.seed), rate, depth, warm)
+                results.add({**line, **found})
                 say(
                     f"vessel {number} ({vessels}), {condition}: {method.name}: {found['hidden_nll']:.3f} nats,"
                     f" {found['psnr_heldout']:.1f} dB, {found['seconds']:.1f} s {found['result']}"
@@ -197,7 +189,13 @@ def _one(method: Method, question: Question, rate: np.ndarray, depth: str, warm:
     }
 
 
-def _rows(lines: Sequence[Line]) -> list[Row]:
+def summary(lines: list[Line], options: Options) -> Summary | None:
+    """Figures of the methods, conditions and vessels that are asked for; None where there are no rows of them."""
+    methods, conditions = options.chosen
+    vessels, names = sorted(objects_of(lines))[: options.n], {m.name for m in methods}
+    lines = [x for x in lines if x["object"] in vessels and x["condition"] in conditions and x["method"] in names]
+    if not lines:
+        return None
     rows = []
     for condition in CONDITIONS:
         here = [line for line in lines if line["condition"] == condition]
@@ -206,7 +204,8 @@ def _rows(lines: Sequence[Line]) -> list[Row]:
             own = [line for line in here if line["method"] == method.name]
             if own:
                 rows += _method_rows(method, condition, own, score)
-    return rows + _over_all(lines)
+    rows += _over_all(lines)
+    return Summary(rows, _tables(Figures(rows)), lambda: draw_frontier(rows))
 
 
 def _over_all(lines: Sequence[Line]) -> list[Row]:
@@ -216,7 +215,7 @@ def _over_all(lines: Sequence[Line]) -> list[Row]:
     for method in METHODS:
         vessels = [
             v
-            for v in sorted({line["object"] for line in lines})
+            for v in sorted(objects_of(lines))
             if all((name, c, v) in of for name in (method.name, FULL) for c in CONDITIONS)
         ]
         if not vessels:
@@ -225,16 +224,13 @@ def _over_all(lines: Sequence[Line]) -> list[Row]:
         own, paper = (np.array([[x["hidden_nll"] for x in each] for each in one]).mean(axis=1) for one in both)
         rows += mean_rows("frontier", method.name, OVER_ALL, "hidden_nll", own, "nats")
         if method.name != FULL:
-            gap = paired_interval(own, paper)
-            for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
-                name = f"hidden_nll_above_paper{label}"
-                rows.append(Row("frontier", method.name, OVER_ALL, name, value, "nats", gap.n))
+            rows += gap_rows("frontier", method.name, OVER_ALL, "hidden_nll_above_paper", own, paper)
             cost = np.array(
                 [[[(x["point_gradients"], x["seconds"] * x["gflops"]) for x in each] for each in one] for one in both]
             ).sum(axis=(1, 2))
             for name, mine, theirs in zip(("fewer_point_gradients", "less_work"), *cost, strict=True):
                 if mine > 0:  # the encoder takes no gradients
-                    rows.append(Row("frontier", method.name, OVER_ALL, name, float(theirs / mine), "", gap.n))
+                    rows.append(Row("frontier", method.name, OVER_ALL, name, float(theirs / mine), "", len(own)))
     return rows
 
 
@@ -253,46 +249,59 @@ def _method_rows(asked: Method, condition: str, own: Sequence[Line], score: dict
     rows.append(Row(name, method, condition, "falsely_free", falsely_free(p_free, occupied > 0), "", len(ranks)))
     for word, other in (("paper", FULL), ("base", asked.base)):
         both = [(x["hidden_nll"], score[other, x["object"]]) for x in own if (other, x["object"]) in score]
-        if not both or method == other:
-            continue
-        gap = paired_interval(*np.array(both).T)
-        for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
-            rows.append(Row(name, method, condition, f"hidden_nll_above_{word}{label}", value, "nats", gap.n))
+        if both and method != other:
+            rows += gap_rows(name, method, condition, f"hidden_nll_above_{word}", *np.array(both).T)
     return rows
 
 
-def _print(rows: Sequence[Row]) -> None:
-    value = {(row.condition, row.method, row.metric): row for row in rows}
-    shown = ("hidden_nll", "hidden_nll_handle", "psnr_heldout", "psnr_heldout_of_mean", "coverage90", "falsely_free")
-    for condition in dict.fromkeys(row.condition for row in rows if row.condition != OVER_ALL):
-        lines = []
-        for method in dict.fromkeys(row.method for row in rows if row.condition == condition):
-            row = {metric: r for (c, m, metric), r in value.items() if (c, m) == (condition, method)}
-            gaps = []
-            for word in ("paper", "base"):
-                ends = [row.get(f"hidden_nll_above_{word}{end}") for end in ("", "_q025", "_q975")]
-                mean, low, high = (f"{end.value:+.3f}" if end else "" for end in ends)
-                gaps.append(f"{mean} ({low} .. {high})" if mean else "")
-            cells = [f"{row[m].value:.3f}" if m in row else "" for m in shown]
-            cost = [f"{row['seconds'].value:.2f}", f"{row['work'].value:.2f}", f"{row['point_gradients'].value:.2e}"]
-            lines.append([method, str(row["hidden_nll"].n), *cells, *cost, *gaps])
+def _tables(of: Figures) -> list[Table]:
+    """Over all conditions, with the gates of the controller; each condition; levers."""
+    groups = {m.name: m for m in METHODS}
+    tables: list[Table] = []
+    header: tuple[str, ...]
+    if OVER_ALL in of.conditions():
+        cells = []
+        for name in of.methods(OVER_ALL):
+            fewer, less = (of(OVER_ALL, name, m) for m in ("fewer_point_gradients", "less_work"))
+            gap = of.interval(OVER_ALL, name, "hidden_nll_above_paper")
+            texts = [ranged(gap, sign="+"), f"{fewer:.1f}"] if name != FULL else ["", ""]
+            if groups[name].group in ("controller", "stages"):
+                texts = [gated(texts[0], gap.high, most=0.01), gated(texts[1], fewer, least=20.0)]
+            nll = of.interval(OVER_ALL, name, "hidden_nll")
+            cells.append([name, str(nll.n), f"{nll.mean:.3f}", *texts, "" if name == FULL else f"{less:.1f}"])
         header = (
-            "method",
-            "n",
-            *shown,
-            "seconds",
-            "work, TFLOP",
-            "point_gradients",
-            "nll above the paper's",
-            "above smc's (delta: from the prior's)",
-        )
-        table(condition, header, lines)
-    lines = []
-    for method in dict.fromkeys(row.method for row in rows if row.condition == OVER_ALL):
-        names = ("hidden_nll", *(f"hidden_nll_above_paper{end}" for end in ("", "_q025", "_q975")))
-        found = [value.get((OVER_ALL, method, name)) for name in (*names, "fewer_point_gradients", "less_work")]
-        cells = [f"{row.value:.{d}f}" if row else "" for row, d in zip(found, (3, 3, 3, 3, 1, 1), strict=True)]
-        lines.append([method, str(value[OVER_ALL, method, "hidden_nll"].n), *cells])
-    if lines:
-        ratios = ("fewer point_gradients", "less work")
-        table(OVER_ALL, ("method", "n", "hidden_nll", "above the paper's", "from", "to", *ratios), lines)
+            "method", "vessels", "hidden_nll", "above the paper's, gate: upper end <= 0.01",
+            "field evaluations, the paper's over its, gate >= 20", "work, the paper's over its",
+        )  # fmt: skip
+        tables.append(Table("Over all conditions together", header, _blank(cells)))
+    shown = {"hidden_nll": 3, "hidden_nll_handle": 2, "seconds": 1, "psnr_heldout": 1, "psnr_heldout_of_mean": 1}
+    shown |= {"coverage90": 2, "falsely_free": 2}
+    for condition in [c for c in of.conditions() if c != OVER_ALL]:
+        cells = []
+        for name in of.methods(condition):
+            gap = of.interval(condition, name, "hidden_nll_above_paper")
+            cells.append([
+                name, str(of.count(condition, name, "hidden_nll")),
+                *(f"{of(condition, name, m):.{digits}f}" for m, digits in shown.items()),
+                f"{of(condition, name, 'point_gradients'):.2e}", ranged(gap, sign="+") if gap.n else "",
+            ])  # fmt: skip
+        header = ("method", "n", *shown, "point_gradients", "hidden_nll above the paper's")
+        tables.append(Table(condition, header, _blank(cells)))
+    cells = []
+    for condition in [c for c in of.conditions() if c != OVER_ALL]:
+        for method in (m for m in METHODS if m.base != m.name and m.group in ("lever off", "smc")):
+            gap = of.interval(condition, method.name, "hidden_nll_above_base")
+            if gap.n:
+                gradients = [of(condition, name, "point_gradients") for name in (method.name, method.base)]
+                cells.append(
+                    [method.name, method.base, str(gap.n), ranged(gap, sign="+"), f"{gradients[0] / gradients[1]:.1f}"]
+                )
+    if cells:
+        header = ("lever", "beside", "vessels", "hidden_nll above it", "field evaluations over its")
+        tables.append(Table(f"Levers, one at a time, {CONDITIONS[0]}", header, cells))
+    return tables
+
+
+def _blank(cells: list[list[str]]) -> list[list[str]]:
+    """A figure that there is none of is an empty cell."""
+    return [["" if cell == "nan" else cell for cell in row] for row in cells]

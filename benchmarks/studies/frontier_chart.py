@@ -1,7 +1,6 @@
 """The picture of `farside bench frontier`: measures against cost, one row a condition and one colour a family."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -43,13 +42,13 @@ LEGEND = {
 JOINED = ("paper", "smc", "controller")
 
 
-def draw_frontier(rows: Sequence[Row], path: Path) -> None:
+def draw_frontier(rows: Sequence[Row]) -> Figure:
     """Every condition that has rows; error bars are 95% intervals over objects."""
     value = {(row.condition, row.method, row.metric): row.value for row in rows}
     counts = [(row.condition, row.n) for row in rows if row.metric == "hidden_nll"]
     conditions = [c for c in CONDITIONS if c in dict(counts)]
     there = {method for _, method, _ in value}
-    figure = Figure(figsize=(17, 3.9 * len(conditions) + 1.0), layout="constrained")
+    figure = Figure(figsize=(17, 3.9 * len(conditions) + 1.0), layout="constrained", dpi=80)
     axes = figure.subplots(len(conditions), len(PANELS), squeeze=False, sharex="col")
     for row, condition in zip(axes, conditions, strict=True):
         for ax, ((metric, cost), title) in zip(row, PANELS.items(), strict=True):
@@ -75,8 +74,7 @@ def draw_frontier(rows: Sequence[Row], path: Path) -> None:
             if group in JOINED:
                 handles[-1].set_linestyle("-")
     figure.legend(handles=handles, loc="outside lower center", ncols=7, fontsize=11)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=80)
+    return figure
 
 
 def _draw_group(

@@ -12,9 +12,8 @@ object, and what is there is not made again.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -22,24 +21,25 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from matplotlib.figure import Figure
 
-from benchmarks.harness.intervals import interval, mean_rows, paired_interval
-from benchmarks.harness.progress import say, table
-from benchmarks.harness.results import FOLDER, Line, append_line, digest, key, newest, read_lines
+from benchmarks.harness.intervals import Figures, gap_rows, mean_rows
+from benchmarks.harness.progress import say
+from benchmarks.harness.results import Line, Results, digest, newest, objects_of
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import PriorOptions, Summary, results_of, resumed, selected
+from benchmarks.harness.tables import Table, ranged
 from benchmarks.measures.metrics import scored_voxels
 from benchmarks.measures.scores import BOXES, random_boxes, score
 from benchmarks.rivals.methods import CONTROLLER, FROM_PRIOR, METHODS, Question, answer, settings_of
 from benchmarks.scenes.conditions import BEHIND, views
 from benchmarks.scenes.vessels import GRID, base_rate
-from perception.inference.settings import ControllerConfig
+from perception.inference.controller import ControllerConfig
 from perception.simulation.simulated_camera import Placed
 from probnerf.fields.base import Model
 from probnerf.inference import likelihood_settings
-from probnerf.prior.checkpoint import load_prior
+from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.rendering.occupancy import solid
 from probnerf.shapes import opacity_grids
 
-RESULTS = FOLDER / "handle.jsonl"
 OWN = CONTROLLER.name
 PRIOR = "the prior alone"
 ASKED = (CONTROLLER, FROM_PRIOR, next(m for m in METHODS if m.name == "encoder alone"))
@@ -49,7 +49,7 @@ EDGES = (0.0, 0.05, 0.3, 0.6, 1.0)  # of p
 PRIOR_SHAPES = 1000
 UNITS = {"said": "", "true": "", "log_score": "nats", "brier": "", "hidden_nll": "nats", "point_gradients": ""}
 COMPARED = ("log_score", "hidden_nll")  # with the controller's
-COLUMNS = ("said", "true", "log_score", "brier", "hidden_nll", *(f"{metric} above" for metric in COMPARED))
+MEASURES = ("said", "true", "log_score", "brier", "hidden_nll")
 
 
 def reach(shapes: Bool[np.ndarray, "s x y z"]) -> Float[np.ndarray, "s"]:
@@ -91,107 +91,127 @@ def log_score(
     return -np.log(np.where(true, p, 1.0 - p))
 
 
-def main(
-    out: Path,
-    quick: bool = False,
-    prior: Path | None = None,
-    n: int = 86,
-    slow: int = 40,
-    methods: str = "",
-    seed: int = 0,
-    results: Path = RESULTS,
-    only_chart: bool = False,
-) -> list[Row]:
-    """How likely the answer says that a handle is behind, against how often one is.
+@dataclass(frozen=True)
+class Options(PriorOptions):
+    """How likely the answer says that a handle is behind, against how often one is."""
 
-    Args:
-        prior: weights to use; the shipped ones by default
-        n: objects
-        slow: of them, those that the controller from the prior answers, too
-        methods: only these, separated by semicolons
-        seed: of the samplers
-        results: file that results are appended to, and read from
-        only_chart: draw what the file holds
-    """
-    if quick:
-        n, slow, results = 1, 0, out / "handle.jsonl" if results == RESULTS else results
-    names = [m.strip() for m in methods.split(";") if m.strip()] or [m.name for m in ASKED]
-    if unknown := set(names) - {m.name for m in ASKED}:
-        raise ValueError(f"no method {sorted(unknown)}; there are: {'; '.join(m.name for m in ASKED)}")
-    loaded, config = load_prior(prior), ControllerConfig()
-    if not only_chart:
-        done = {key(line) for line in read_lines(results)}
-        rate = base_rate(128 if quick else 1024, config=config.observe)
-        for method in (m for m in ASKED if m.name in names):
-            told = {"digest": digest([settings_of(method, config), asdict(config)], quick)}
-            own = {"prior": loaded.hash, "method": method.name, "settings": told, "condition": BEHIND, "seed": seed}
-            count = min(n, slow) if method is FROM_PRIOR else n
+    n: int = 86
+    """Objects."""
+    slow: int = 40
+    """Of them, those that the controller from the prior answers, too."""
+    methods: str = ""
+    """Only these, separated by semicolons."""
 
-            def known(number: int, own: Line = own) -> bool:
-                return key({**own, "object": number}) in done
-
-            for number, view in views(BEHIND, count, known):
-                if view is None:
-                    continue
-                found, sampled, positions = answer(method, Question(view, loaded, config, seed))
-                p = float(found.weights @ has_handle(loaded.model, positions))
-                rng = np.random.default_rng([seed, view.seed, 31])
-                boxes = random_boxes(scored_voxels(view.seen, rate), BOXES, rng)
-                line = {
-                    **own,
-                    "object": number,
-                    "p": round(p, 5),
-                    "shapes": len(found.weights),
-                    "handle": bool(Placed(number, 0.0, 0.0, 0.0).shape.has_handle),
-                    "hidden_nll": round(float(score(view, found, rate, boxes, rng).values["hidden_nll"]), 5),
-                    "point_gradients": float(f"{sampled.point_gradients:.4g}"),
-                    "result": found.result,
-                }
-                append_line(results, line)
-                say(f"{number}, {method.name}: {p:.2f}, handle {line['handle']}, {line['hidden_nll']:.3f} nats")
-    lines = [x for x in newest(read_lines(results), loaded.hash, seed) if x["method"] in names]
-    if not lines:
-        raise ValueError(f"{results} has no results of this prior and these methods; leave --only-chart")
-    drawn = jax.random.normal(jax.random.key(0), (PRIOR_SHAPES, loaded.model.latent))
-    rows = _rows(lines, float(has_handle(loaded.model, drawn).mean()))
-    _draw(lines, out / "handle.png")
-    return rows
+    @property
+    def asked(self) -> list[str]:
+        """Methods by name."""
+        return selected(self.methods, [m.name for m in ASKED], "method")
 
 
-def _rows(lines: Sequence[Line], prior_says: float) -> list[Row]:
-    """Every method's means, shares by p and differences from the controller's, object by object; shown as a table."""
+def main(options: Options) -> Summary:
+    """Measure what the file lacks, and sum up what it has."""
+    if options.quick:
+        options = replace(options, n=1, slow=0)
+    _ = options.asked  # a mistyped name is refused before anything is loaded
+    prior, results = load_prior(options.prior), results_of("handle", options)
+    return resumed(
+        results,
+        options,
+        lambda: _measure(options, prior, results),
+        lambda: summary(newest(results.lines, prior.hash, options.seed), options),
+    )
+
+
+def _measure(options: Options, prior: Prior, results: Results) -> None:
+    config = ControllerConfig()
+    common = {"prior": prior.hash, "condition": BEHIND, "seed": options.seed}
+    alone = {**common, "method": PRIOR, "settings": {"shapes": PRIOR_SHAPES}, "object": "any"}
+    if alone not in results:
+        drawn = jax.random.normal(jax.random.key(0), (PRIOR_SHAPES, prior.model.latent))
+        results.add({**alone, "p": float(has_handle(prior.model, drawn).mean())})
+    rate = base_rate(128 if options.quick else 1024, config=config.observe)
+    for method in (m for m in ASKED if m.name in options.asked):
+        settings = {"digest": digest([settings_of(method, config), asdict(config)], options.quick)}
+        own = {**common, "method": method.name, "settings": settings}
+        count = min(options.n, options.slow) if method is FROM_PRIOR else options.n
+
+        def known(number: int, own: Line = own) -> bool:
+            return {**own, "object": number} in results
+
+        for number, view in views(BEHIND, count, known):
+            if view is None:
+                continue
+            found, sampled, positions = answer(method, Question(view, prior, config, options.seed))
+            p = float(found.weights @ has_handle(prior.model, positions))
+            rng = np.random.default_rng([options.seed, view.seed, 31])
+            boxes = random_boxes(scored_voxels(view.seen, rate), BOXES, rng)
+            line = {
+                **own,
+                "object": number,
+                "p": round(p, 5),
+                "shapes": len(found.weights),
+                "handle": bool(Placed(number, 0.0, 0.0, 0.0).shape.has_handle),
+                "hidden_nll": round(float(score(view, found, rate, boxes, rng).values["hidden_nll"]), 5),
+                "point_gradients": float(f"{sampled.point_gradients:.4g}"),
+                "result": found.result,
+            }
+            results.add(line)
+            say(f"{number}, {method.name}: {p:.2f}, handle {line['handle']}, {line['hidden_nll']:.3f} nats")
+
+
+def summary(lines: list[Line], options: Options) -> Summary | None:
+    """Means of every method, shares by p, and differences from the controller's; None where there are no rows."""
+    alone = [line for line in lines if line["method"] == PRIOR]
+    lines = [line for line in lines if line["method"] in options.asked]
+    if not lines or not alone:
+        return None
     own = [x for x in lines if x["method"] == OWN] or [x for x in lines if x["method"] == lines[0]["method"]]
-    says = {"method": PRIOR, "p": prior_says, "shapes": PRIOR_SHAPES}
-    lines = [*lines, *({**says, "object": x["object"], "handle": x["handle"]} for x in own)]
-    rows, cells = [], []
+    says = {"method": PRIOR, "p": alone[-1]["p"], "shapes": PRIOR_SHAPES}
+    rows = _rows([*lines, *({**says, "object": x["object"], "handle": x["handle"]} for x in own)])
+    return Summary(rows, _tables(Figures(rows)), lambda: _draw(lines))
+
+
+def _rows(lines: Sequence[Line]) -> list[Row]:
+    rows = []
     reference: dict[str, dict[int, float]] = {}  # the controller's, by metric and object
     for method in (*(m.name for m in ASKED), PRIOR):
         own = [x for x in lines if x["method"] == method]
         if not own:
             continue
-        values, objects = _values(own), [x["object"] for x in own]
-        shown = {}
+        values, objects = _values(own), objects_of(own)
         for metric, each in values.items():
             rows += mean_rows("handle", method, BEHIND, metric, each, UNITS[metric])
-            i = interval(each)
-            shown[metric] = f"{i.mean:.3f} ({i.low:.2f}..{i.high:.2f})"
         for low, high, inside in _bins(values["said"]):
             for metric in ("said", "true"):
-                told, mean = f"{metric} where p is {low:g} to {high:g}", float(values[metric][inside].mean())
-                rows.append(Row("handle", method, BEHIND, told, mean, "", int(inside.sum())))
+                where, mean = f"{metric} where p is {low:g} to {high:g}", float(values[metric][inside].mean())
+                rows.append(Row("handle", method, BEHIND, where, mean, "", int(inside.sum())))
         if method == OWN:
             reference = {m: dict(zip(objects, each.tolist(), strict=True)) for m, each in values.items()}
         for metric in [m for m in COMPARED if m in values and method != OWN]:
             both = [k for k, number in enumerate(objects) if number in reference.get(metric, {})]
-            if not both:
-                continue
-            gap = paired_interval(values[metric][both], np.array([reference[metric][objects[k]] for k in both]))
-            for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
-                rows.append(Row("handle", method, BEHIND, f"{metric}_above_controller{label}", value, "nats", gap.n))
-            shown[f"{metric} above"] = f"{gap.mean:+.3f} ({gap.low:+.3f}..{gap.high:+.3f})"
-        cells.append([method, str(len(own)), *(shown.get(column, "") for column in COLUMNS)])
-    table("Is a handle behind it?", ("method", "n", *COLUMNS), cells)
+            if both:
+                theirs = [reference[metric][objects[k]] for k in both]
+                rows += gap_rows("handle", method, BEHIND, f"{metric}_above_controller", values[metric][both], theirs)
     return rows
+
+
+def _tables(of: Figures) -> list[Table]:
+    means, shares = [], []
+    for method in of.methods(BEHIND):
+        cells = [ranged(of.interval(BEHIND, method, m)) if (BEHIND, method, m) in of else "" for m in MEASURES]
+        above = [f"{metric}_above_controller" for metric in COMPARED]
+        cells += [ranged(of.interval(BEHIND, method, m), sign="+") if (BEHIND, method, m) in of else "" for m in above]
+        means.append([method, str(of.count(BEHIND, method, "said")), *cells])
+        for low, high in pairwise(EDGES):
+            names = [f"{metric} where p is {low:g} to {high:g}" for metric in ("said", "true")]
+            if method != PRIOR and (BEHIND, method, names[0]) in of:
+                pair = (f"{of(BEHIND, method, name):.3f}" for name in names)
+                shares.append([method, f"{low:g} to {high:g}", str(of.count(BEHIND, method, names[0])), *pair])
+    header = ("method", "n", *MEASURES, *(f"{metric} above the controller's" for metric in COMPARED))
+    return [
+        Table("Is a handle behind it?", header, means),
+        Table("By what was said", ("method", "p", "objects", "mean p", "share with a handle"), shares),
+    ]
 
 
 def _values(lines: Sequence[Line]) -> dict[str, Float[np.ndarray, "n"]]:
@@ -207,7 +227,7 @@ def _bins(p: Float[np.ndarray, "n"]) -> list[tuple[float, float, Bool[np.ndarray
     return [(low, high, which == b) for b, (low, high) in enumerate(pairwise(EDGES)) if (which == b).any()]
 
 
-def _draw(lines: Sequence[Line], path: Path) -> None:
+def _draw(lines: Sequence[Line]) -> Figure:
     """What each method said of objects with a handle and without; said against true, in bins of what was said."""
     figure = Figure(figsize=(11, 4.4), layout="constrained")
     each, bins = figure.subplots(1, 2, width_ratios=(3, 2))
@@ -231,5 +251,4 @@ def _draw(lines: Sequence[Line], path: Path) -> None:
     bins.plot([0, 1], [0, 1], "k--", linewidth=1)
     bins.set(xlabel="P(a handle is behind)", ylabel="share with one", title="said and true", ylim=(-0.05, 1.05))
     bins.legend(fontsize=9)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    return figure

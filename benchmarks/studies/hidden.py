@@ -16,21 +16,22 @@ All vessels have a handle, while the view leaves open whether there is one: rank
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchmarks.harness.intervals import interval, mean_rows, paired_interval
-from benchmarks.harness.progress import say, table
+from benchmarks.harness.intervals import gap_rows, interval, mean_rows, paired_interval
+from benchmarks.harness.progress import say
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import PriorTableOptions, Summary
+from benchmarks.harness.tables import Table, between, gated
 from benchmarks.measures.metrics import coverage, falsely_free, ks_distance, scored_voxels
 from benchmarks.measures.scores import BOXES, Answer, random_boxes, score
 from benchmarks.rivals.quick import METHODS, POSTERIOR, RivalConfig, answers, warm_up
 from benchmarks.scenes.vessels import VesselView, base_rate, hidden_vessel
-from perception.inference.settings import ControllerConfig
+from perception.inference.controller import ControllerConfig
 from probnerf.objects.tabletop import TEST_SEEDS
 from probnerf.prior.checkpoint import load_prior
 
@@ -76,30 +77,27 @@ def judge(
     )
 
 
-def main(
-    out: Path,
-    quick: bool = False,
-    prior: Path | None = None,
-    n: int = 30,
-    seed: int = 0,
-    budget_s: float = 60.0,
-    stages: int = 0,
-) -> list[Row]:
-    """What one view of a vessel does not show: the posterior beside prior, encoder and MAP, handles hidden.
+@dataclass(frozen=True)
+class Options(PriorTableOptions):
+    """What one view of a vessel does not show: the posterior beside prior, encoder and MAP, handles hidden."""
 
-    Args:
-        prior: weights to use; the shipped ones by default
-        n: vessels
-        seed: of the samplers
-        budget_s: seconds that the sampler may take per vessel
-        stages: stages that it may take instead of the budget (0: the budget holds)
-    """
-    n = min(n, 3) if quick else n
-    loaded, config, rivals = load_prior(prior), ControllerConfig(), RivalConfig()
-    if quick:
+    n: int = 30
+    """Vessels."""
+    budget_s: float = 60.0
+    """Seconds that the sampler may take per vessel."""
+    stages: int = 0
+    """Stages that it may take instead of the budget (0: the budget holds)."""
+
+
+def main(options: Options) -> Summary:
+    """Measure, and sum up."""
+    n, seed, budget_s, stages = options.n, options.seed, options.budget_s, options.stages
+    loaded, config, rivals = load_prior(options.prior), ControllerConfig(), RivalConfig()
+    if options.quick:
+        n = min(n, 3)
         rivals = replace(rivals, yaws=12, fit=replace(rivals.fit, steps=60, screen_steps=20))
         budget_s = min(budget_s, 10.0)
-    rate = base_rate(128 if quick else 1024, config=config.observe)
+    rate = base_rate(128 if options.quick else 1024, config=config.observe)
     judged: list[Judged] = []
     sizes: set[tuple[int, ...]] = set()
     for family_seed in TEST_SEEDS:
@@ -113,10 +111,7 @@ def main(
         judged.append(judge(vessel, given, rate, seed, warm=bool(judged)))
         figures = ", ".join(f"{m} {v['hidden_nll']:.3f}" for m, v in judged[-1].values.items())
         say(f"{len(judged):3d} vessel {family_seed}: {figures} nats ({judged[-1].result})")
-    rows = _rows(judged)
-    _print(judged)
-    _draw(judged, out / "hidden.png")
-    return rows
+    return Summary(_rows(judged), [_table(judged)], lambda: _draw(judged))
 
 
 def _column(judged: Sequence[Judged], method: str, metric: str) -> Float[np.ndarray, "n"]:
@@ -141,15 +136,14 @@ def _rows(judged: Sequence[Judged]) -> list[Row]:
         if method == POSTERIOR:
             continue
         for metric in ("hidden_nll", "hidden_nll_handle"):
-            gap = paired_interval(_column(judged, method, metric), _column(judged, POSTERIOR, metric))
-            for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
-                rows.append(Row("hidden", method, CONDITION, f"{metric}_above_posterior{label}", value, "nats", gap.n))
+            own, posterior = (_column(judged, m, metric) for m in (method, POSTERIOR))
+            rows += gap_rows("hidden", method, CONDITION, f"{metric}_above_posterior", own, posterior)
     done = [float(j.result == "converged") for j in judged]
     rows.append(Row("hidden", POSTERIOR, CONDITION, "converged", float(np.mean(done)), "", len(done)))
     return rows
 
 
-def _print(judged: Sequence[Judged]) -> None:
+def _table(judged: Sequence[Judged]) -> Table:
     lines = []
     for method in METHODS:
         cells = [method]
@@ -157,14 +151,13 @@ def _print(judged: Sequence[Judged]) -> None:
             cells.append(f"{interval(_column(judged, method, metric)).mean:.3f}")
         for metric in ("hidden_nll", "hidden_nll_handle"):
             gap = paired_interval(_column(judged, method, metric), _column(judged, POSTERIOR, metric))
-            beaten = "" if method == POSTERIOR else f"{gap.low:+.3f} .. {gap.high:+.3f}"
-            cells.append(beaten + (" (not beaten)" if beaten and gap.low <= 0 else ""))
+            cells.append("" if method == POSTERIOR else gated(between(gap, sign="+"), gap.low, least=0.0))
         lines.append(cells)
-    header = ("method", *PER_OBJECT, "nll above posterior's, 95%", "on the handle stratum")
-    table(f"{len(judged)} vessels, {CONDITION}, smoothed alike", header, lines)
+    header = ("method", *PER_OBJECT, "hidden_nll above the posterior's, gate > 0", "on the handle stratum, gate > 0")
+    return Table(f"{len(judged)} vessels, {CONDITION}, smoothed alike", header, lines)
 
 
-def _draw(judged: Sequence[Judged], path: Path) -> None:
+def _draw(judged: Sequence[Judged]) -> Figure:
     """Scores with intervals, reliability, ranks; below, three vessels: the view, the truth, each method's answer."""
     figure = Figure(figsize=(15, 15), layout="constrained")
     top, bottom = np.asarray(figure.subfigures(2, 1, height_ratios=(1, 2.2)))
@@ -207,8 +200,7 @@ def _draw(judged: Sequence[Judged], path: Path) -> None:
     bottom.suptitle(
         "Level section through the hidden handle, camera at the top: probability of being occupied, truth in white"
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    return figure
 
 
 def _draw_reliability(judged: Sequence[Judged], ax: Axes) -> None:

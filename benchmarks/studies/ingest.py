@@ -26,6 +26,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.harness.progress import say
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import Summary, TableOptions
 from benchmarks.scenes.recording import noisy
 from perception.answers.query import query
 from perception.answers.regions import Points
@@ -145,22 +146,27 @@ def inference() -> tuple[Callable[[Frame], None], Callable[[], None]]:
     return work, ask
 
 
-def main(out: Path, quick: bool = False, seconds: float = 60.0) -> list[Row]:
-    """Taking frames in: 30 Hz RGB-D through the reader into a recording, with and without inference beside it.
+@dataclass(frozen=True)
+class Options(TableOptions):
+    """Taking frames in: 30 Hz RGB-D through the reader into a recording, with and without inference beside it."""
 
-    Args:
-        seconds: of each condition (quick: at most 3)
-    """
+    seconds: float = 60.0
+    """Of each condition (quick: at most 3)."""
+
+
+def main(options: Options) -> Summary:
+    """Measure, and sum up."""
+    seconds = options.seconds
     if not seconds > 0:
         raise ValueError(f"seconds is {seconds:g}; give more than 0")
-    seconds = min(seconds, 3.0) if quick else seconds
+    seconds = min(seconds, 3.0) if options.quick else seconds
     taken = {}
-    with tempfile.TemporaryDirectory(dir=out) as folder:
+    with tempfile.TemporaryDirectory(dir=options.out) as folder:
         for condition, (work, ask) in {"idle": (None, None), "inference": inference()}.items():
             say(f"{condition}: {seconds:g} s at {FPS:g} Hz")
             taken[condition] = take_in(seconds, Path(folder) / f"{condition}.mcap", work, ask)
-    _draw(taken, out / "ingest.png")
-    return [row for condition, result in taken.items() for row in _rows(condition, result)]
+    rows = [row for condition, result in taken.items() for row in _rows(condition, result)]
+    return Summary(rows, picture=lambda: _draw(taken))
 
 
 def _rows(condition: str, t: Taken) -> list[Row]:
@@ -186,9 +192,9 @@ def _rows(condition: str, t: Taken) -> list[Row]:
     return [Row("ingest", "Reader", condition, metric, float(value), unit, n) for metric, value, unit, n in values]
 
 
-def _draw(taken: dict[str, Taken], path: Path) -> None:
+def _draw(taken: dict[str, Taken]) -> Figure:
     """Ages of the frames when they were handed over, as cumulative shares."""
-    figure = Figure(figsize=(7, 4), layout="constrained")
+    figure = Figure(figsize=(7, 4), layout="constrained", dpi=110)
     ax = figure.subplots()
     for (condition, t), colour in zip(taken.items(), ("tab:blue", "tab:orange"), strict=False):
         for ages, who, style in ((t.newest_age, "newest, for inference", "-"), (t.listener_age, "every frame", ":")):
@@ -202,5 +208,4 @@ def _draw(taken: dict[str, Taken], path: Path) -> None:
     )
     ax.set_ylim(0, 1.02)
     ax.legend(loc="upper left", fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    return figure

@@ -19,7 +19,7 @@ timed in turn, round after round, and medians are given: their ratios hold on a 
 import math
 import os
 from collections.abc import Callable
-from pathlib import Path
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -31,12 +31,13 @@ from matplotlib.figure import Figure
 from benchmarks.harness.machine import SIDE, median_seconds, squared
 from benchmarks.harness.progress import say
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import Summary, TableOptions
 from perception.observation.rays import observe
 from perception.observation.segmentation import segment
 from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.recording import Log
 from probnerf.fields.mlp import MLPField, encoded_size
-from probnerf.inference import likelihood_of, with_sizes
+from probnerf.inference import InferConfig, likelihood_of, with_sizes
 from probnerf.kernel import library
 from probnerf.likelihood import kernel_call
 from probnerf.likelihood.dispatch import log_likelihood, plain_log_likelihood
@@ -44,7 +45,6 @@ from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.prior.checkpoint import load_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering.foam import FAR
-from probnerf.settings import InferConfig
 from probnerf.types import OBJECT, Observation, joined
 
 
@@ -78,12 +78,17 @@ class Haze(Given):
 CHAINS, SCHEDULE = 8, 100 * 100 + 1  # of the paper: chains, gradients of each
 
 
-def main(out: Path, quick: bool = False, repeats: int = 9) -> list[Row]:
-    """The kernel's speed beside plain JAX and the machine's matrix products.
+@dataclass(frozen=True)
+class Options(TableOptions):
+    """The kernel's speed beside plain JAX and the machine's matrix products."""
 
-    Args:
-        repeats: rounds, of which medians are given (quick: 3)
-    """
+    repeats: int = 9
+    """Rounds, of which medians are given (quick: 3)."""
+
+
+def main(options: Options) -> Summary:
+    """Measure, and sum up."""
+    quick, repeats = options.quick, options.repeats
     if repeats < 1:
         raise ValueError(f"repeats is {repeats}; give 1 or more")
     if not library.available():
@@ -109,8 +114,7 @@ def main(out: Path, quick: bool = False, repeats: int = 9) -> list[Row]:
     for method, points in grown.items():
         exponent = float(np.polyfit(np.log([n for n, _ in points]), np.log([t for _, t in points]), 1)[0])
         rows.append(Row("kernel", "kernel with hypernetwork", method, "exponent", exponent, "", repeats))
-    _draw(rows, grown, out / "kernel.png")
-    return rows
+    return Summary(rows, picture=lambda: _draw(rows, grown))
 
 
 def _growth(model: ProbNeRF, view: Observation, repeats: int) -> dict[str, list[tuple[int, float]]]:
@@ -224,12 +228,12 @@ def _colour_size(field: MLPField) -> int:
     return (encoded_size(field.octaves, 3 + field.radial) + 1) * h + h * h + 3 * h
 
 
-def _draw(rows: list[Row], grown: dict[str, list[tuple[int, float]]], path: Path) -> None:
+def _draw(rows: list[Row], grown: dict[str, list[tuple[int, float]]]) -> Figure:
     """Shares of the peak, by path and case; time by particles and by rays."""
     shares = [row for row in rows if row.metric == "share_of_peak"]
     conditions = list(dict.fromkeys(row.condition for row in shares))
     methods = list(dict.fromkeys(row.method for row in shares))
-    figure = Figure(figsize=(13, 1.2 + 0.22 * len(shares)), layout="constrained")
+    figure = Figure(figsize=(13, 1.2 + 0.22 * len(shares)), layout="constrained", dpi=110)
     ax, growth = figure.subplots(1, 2, width_ratios=(2, 1))
     for condition, points in grown.items():
         growth.loglog(*zip(*points, strict=True), "o-", label=condition)
@@ -246,5 +250,4 @@ def _draw(rows: list[Row], grown: dict[str, list[tuple[int, float]]], path: Path
     ax.axvline(100.0, color="k", linewidth=0.7)
     ax.set(xlabel=f"operations of plain JAX over the machine's matrix product, % ({os.cpu_count()} cores)")
     ax.legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    return figure

@@ -13,35 +13,37 @@ did not see, by the true geometry, smoothed as everywhere. Results are appended 
 there is not made again.
 """
 
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
-from benchmarks.harness.intervals import mean_rows, paired_interval
-from benchmarks.harness.progress import say, table
-from benchmarks.harness.results import FOLDER, Line, append_line, digest, key, newest, read_lines, refuse_cut
+from benchmarks.harness.intervals import Figures, gap_rows, mean_rows
+from benchmarks.harness.progress import say
+from benchmarks.harness.results import Line, Results, digest, newest, refuse_cut
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import PriorOptions, Summary, results_of, resumed
+from benchmarks.harness.tables import Table, gated, ranged
 from benchmarks.measures.metrics import hidden_nll, scored_voxels
 from benchmarks.scenes.conditions import any_view
 from benchmarks.scenes.vessels import GRID, VesselPicture, VesselView, base_rate, vessel_view
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.next_view import rank_views, ring_of_views
-from perception.inference.settings import ControllerConfig
+from perception.inference.controller import ControllerConfig
 from perception.inference.tracker import Tracker
 from perception.observation.segmentation import segment
 from perception.simulation.sensor_faults import sense
 from perception.simulation.simulated_camera import Scene, render
 from probnerf.objects.tabletop import TEST_SEEDS
-from probnerf.prior.checkpoint import load_prior
+from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.rendering.occupancy import coarsen, voxel_centres
 
-RESULTS = FOLDER / "next_view.jsonl"
 FIRST = 8000  # among the test seeds: objects of no other measurement
 NONE, SUGGESTED, RANDOM, FARTHEST = CHOICES = ("first picture alone", "suggested", "random", "farthest")
 COLOURS = dict(zip(CHOICES, ("tab:gray", "tab:blue", "tab:orange", "tab:green"), strict=True))
+CONDITION = "any view"
+MOVED = "taken for a moved object"
 STAGES = 240  # at most, a picture
 
 
@@ -79,59 +81,52 @@ def shapes_in(view: VesselView, picture: VesselPicture, h: Hypotheses) -> Bool[n
     return coarsen(shapes.reshape(h.solid.shape), GRID)
 
 
-def main(
-    out: Path,
-    quick: bool = False,
-    prior: Path | None = None,
-    n: int = 50,
-    seed: int = 0,
-    results: Path = RESULTS,
-    only_chart: bool = False,
-) -> list[Row]:
-    """Unseen space after a second picture: from the suggested place, a random one and the farthest one.
+@dataclass(frozen=True)
+class Options(PriorOptions):
+    """Unseen space after a second picture: from the suggested place, a random one and the farthest one."""
 
-    Args:
-        prior: weights to use; the shipped ones by default
-        n: objects
-        seed: of the samplers and of the random places
-        results: file that results are appended to, and read from
-        only_chart: draw what the file holds
-    """
-    if quick:
-        n, results = min(n, 2), out / "next_view.jsonl" if results == RESULTS else results
-    loaded, config = load_prior(prior), ControllerConfig()
-    settings = {"digest": digest(asdict(config), quick)}
-    common = {"prior": loaded.hash, "settings": settings, "seed": seed, "condition": "any view"}
-    if not only_chart:
-        done = {key(line) for line in read_lines(results)}
-        rate = base_rate(128 if quick else 1024, config=config.observe)
-        found = 0
-        for number in TEST_SEEDS[FIRST:]:
-            if found == n:
-                break
-            if all(key({**common, "method": who, "object": number}) in done for who in CHOICES):
-                found += 1
-                continue
-            picture = any_view(number)
-            try:
-                view = vessel_view(picture)
-                answered = _measured(Tracker(loaded, config, seed=seed), picture, view, rate, seed)
-            except ValueError as refusal:  # outside perception's range of sizes, or too few pixels in either picture
-                say(f"object {number} is left out: {refusal}")
-                continue
+    n: int = 50
+    """Objects."""
+
+
+def main(options: Options) -> Summary:
+    """Measure what the file lacks, and sum up what it has."""
+    if options.quick:
+        options = replace(options, n=min(options.n, 2))
+    prior, results = load_prior(options.prior), results_of("next_view", options)
+    return resumed(
+        results,
+        options,
+        lambda: _measure(options, prior, results),
+        lambda: summary(newest(results.lines, prior.hash, options.seed), options),
+    )
+
+
+def _measure(options: Options, prior: Prior, results: Results) -> None:
+    config, found = ControllerConfig(), 0
+    common = {"prior": prior.hash, "seed": options.seed, "condition": CONDITION}
+    common["settings"] = {"digest": digest(asdict(config), options.quick)}
+    rate = base_rate(128 if options.quick else 1024, config=config.observe)
+    for number in TEST_SEEDS[FIRST:]:
+        if found == options.n:
+            break
+        if all({**common, "method": who, "object": number} in results for who in CHOICES):
             found += 1
-            for who, line in answered.items():
-                append_line(results, {**common, "method": who, "object": number, **line})
-            say(f"{found}, object {number}: " + ", ".join(f"{w} {v['hidden_nll']:.3f}" for w, v in answered.items()))
-    lines = newest(read_lines(results), loaded.hash, seed)
-    if not lines:
-        raise ValueError(f"{results} has no results of this prior; leave --only-chart")
-    rows, by = _rows(lines)
-    _draw(by, out / "next_view.png")
-    return rows
+            continue
+        picture = any_view(number)
+        try:
+            view = vessel_view(picture)
+            answered = _answered(Tracker(prior, config, seed=options.seed), picture, view, rate, options.seed)
+        except ValueError as refusal:  # outside perception's range of sizes, or too few pixels in either picture
+            say(f"object {number} is left out: {refusal}")
+            continue
+        found += 1
+        for who, line in answered.items():
+            results.add({**common, "method": who, "object": number, **line})
+        say(f"{found}, object {number}: " + ", ".join(f"{w} {v['hidden_nll']:.3f}" for w, v in answered.items()))
 
 
-def _measured(
+def _answered(
     tracker: Tracker, picture: VesselPicture, view: VesselView, rate: Float[np.ndarray, "32 32 32"], seed: int
 ) -> dict[str, Line]:
     scored = scored_voxels(view.seen, rate)
@@ -149,27 +144,30 @@ def _measured(
     return lines
 
 
-def _rows(lines: list[Line]) -> tuple[list[Row], dict[str, Float[np.ndarray, "n"]]]:
+def summary(lines: list[Line], options: Options) -> Summary | None:
+    """Figures of the objects that every choice has a row of; None where there are none."""
     complete = set.intersection(*({line["object"] for line in lines if line["method"] == who} for who in CHOICES))
+    if not complete:
+        return None
     chosen = sorted((line for line in lines if line["object"] in complete), key=lambda line: line["object"])
     by = {who: np.array([line["hidden_nll"] for line in chosen if line["method"] == who]) for who in CHOICES}
-    rows, cells = [], []
+    rows = []
     for who, values in by.items():
-        rows += mean_rows("next_view", who, "any view", "hidden_nll", values, "nats")
-        gap = paired_interval(values, by[SUGGESTED])
-        for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
-            rows.append(
-                Row("next_view", who, "any view", f"hidden_nll_above_suggested{label}", value, "nats", len(values))
-            )
-        moved = sum(line["change"] == "moved" for line in chosen if line["method"] == who)
-        rows.append(Row("next_view", who, "any view", "taken for a moved object", moved / len(values), "", len(values)))
-        cells.append([who, f"{values.mean():.3f}", f"{gap.mean:+.3f} ({gap.low:+.3f}..{gap.high:+.3f})", str(moved)])
-    title = f"{len(complete)} objects, unseen by the first picture"
-    table(title, ("second picture", "hidden_nll", "above suggested's, 95%", "taken for a moved object"), cells)
-    return rows, by
+        rows += mean_rows("next_view", who, CONDITION, "hidden_nll", values, "nats")
+        rows += gap_rows("next_view", who, CONDITION, "hidden_nll_above_suggested", values, by[SUGGESTED])
+        moved = [line["change"] == "moved" for line in chosen if line["method"] == who]
+        rows.append(Row("next_view", who, CONDITION, MOVED, float(np.mean(moved)), "", len(moved)))
+    of, cells = Figures(rows), []
+    for who in by:
+        gap = of.interval(CONDITION, who, "hidden_nll_above_suggested")
+        above = "" if who == SUGGESTED else gated(ranged(gap, sign="+"), gap.low, least=0.0)
+        cells.append([who, f"{of(CONDITION, who, 'hidden_nll'):.3f}", above, f"{of(CONDITION, who, MOVED):.0%}"])
+    title = f"{len(complete)} objects, nats a voxel over what the first picture did not see"
+    header = ("second picture", "hidden_nll", "above the suggested place's, gate > 0", MOVED)
+    return Summary(rows, [Table(title, header, cells)], lambda: _draw(by))
 
 
-def _draw(by: dict[str, Float[np.ndarray, "n"]], path: Path) -> None:
+def _draw(by: dict[str, Float[np.ndarray, "n"]]) -> Figure:
     """Scores by who chose; each object's, against the suggested place's."""
     figure = Figure(figsize=(10, 4.6), layout="constrained")
     bars, each = figure.subplots(1, 2)
@@ -185,5 +183,4 @@ def _draw(by: dict[str, Float[np.ndarray, "n"]], path: Path) -> None:
     each.plot([0, top], [0, top], "k--", linewidth=1)
     each.set(xlabel="second picture as suggested, nats", ylabel="chosen otherwise, nats", title="each object")
     each.legend(fontsize=9)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    return figure

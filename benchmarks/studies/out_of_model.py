@@ -19,7 +19,7 @@ Answers are appended to a file as they come, and what is there is not made again
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,79 +28,74 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from benchmarks.harness.intervals import mean_rows
-from benchmarks.harness.progress import say, table
-from benchmarks.harness.results import FOLDER, Line, append_line, digest, key, newest, read_lines, refuse_cut
+from benchmarks.harness.intervals import Figures, mean_rows
+from benchmarks.harness.progress import say
+from benchmarks.harness.results import Line, Results, digest, newest, refuse_cut
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import PriorOptions, Summary, results_of, resumed
+from benchmarks.harness.tables import Table, gated
 from benchmarks.measures.metrics import falsely_free, scored_voxels
 from benchmarks.measures.scores import BOXES, Answer, as_queried, random_boxes, score
 from benchmarks.scenes.conditions import any_view
 from benchmarks.scenes.faults import noise_frame
 from benchmarks.scenes.meshes import mesh_view
 from benchmarks.scenes.vessels import GRID, VesselView, base_rate, vessel_view
-from perception.inference.controller import estimate
-from perception.inference.settings import ControllerConfig
+from perception.inference.controller import ControllerConfig, estimate
 from perception.sources.frame import Frame
 from probnerf.objects.tabletop import TEST_SEEDS
 from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.rendering.occupancy import coarsen
 from probnerf.types import UNKNOWN
 
-RESULTS = FOLDER / "out_of_model.jsonl"
 MESHES = Path(__file__).resolve().parent.parent.parent.parent / "shared" / "data" / "meshes" / "bullet3"
 FAMILY, STRANGERS, NOISE = CONDITIONS = ("the family", "others' meshes", "noise")
+METHOD = "tempered_smc"
 FIRST = 8000  # of the test seeds: none of the other benchmarks' objects
 CHECKS = {"explained": "share of pixels explained", "evidence": "log evidence a pixel"}
 COLOURS = {STRANGERS: "tab:red", NOISE: "tab:gray"}
 
 
-def main(
-    out: Path,
-    quick: bool = False,
-    prior: Path | None = None,
-    n: int = 60,
-    noise: int = 20,
-    meshes: Path = MESHES,
-    seed: int = 0,
-    results: Path = RESULTS,
-    only_chart: bool = False,
-) -> list[Row]:
-    """Whether strangers to the prior are flagged, and what is said of the space behind them.
+@dataclass(frozen=True)
+class Options(PriorOptions):
+    """Whether strangers to the prior are flagged, and what is said of the space behind them."""
 
-    Args:
-        prior: weights to use; the shipped ones by default
-        n: objects of the family, and meshes at most
-        noise: objects of noise
-        meshes: folder under which the meshes (.obj) lie
-        seed: of the sampler
-        results: file that answers are appended to, and read from
-        only_chart: draw what the file holds
-    """
-    if quick:
-        n, noise, results = min(n, 1), min(noise, 1), out / "out_of_model.jsonl" if results == RESULTS else results
-    loaded, config = load_prior(prior), ControllerConfig()
-    settings = {"digest": digest(asdict(config), quick)}
-    common = {"prior": loaded.hash, "method": "tempered_smc", "settings": settings, "seed": seed}
-    if not only_chart:
-        done = {key(line) for line in read_lines(results)}
-        rate = base_rate(128 if quick else 1024, config=config.observe)
-        for condition, name, make in _views(n, noise, meshes):
-            line: Line = {**common, "condition": condition, "object": name}
-            if key(line) in done:
-                continue
-            try:
-                view = make()
-                answered = _answered(view, loaded, config, rate, seed)
-            except ValueError as error:
-                answered = {"refused": str(error)}
-            append_line(results, {**line, **answered})
-            say(f"{condition}, {name}: " + json.dumps({k: v for k, v in answered.items() if not isinstance(v, list)}))
-    lines = newest(read_lines(results), loaded.hash, seed)
-    if {line["condition"] for line in lines if "refused" not in line} != set(CONDITIONS):
-        raise ValueError(f"{results} lacks a condition of {CONDITIONS} for this prior; leave --only-chart")
-    rows = _rows(lines)
-    _draw(lines, out / "out_of_model.png")
-    return rows
+    n: int = 60
+    """Objects of the family, and meshes at most."""
+    noise: int = 20
+    """Objects of noise."""
+    meshes: Path = MESHES
+    """Folder under which the meshes (.obj) lie."""
+
+
+def main(options: Options) -> Summary:
+    """Measure what the file lacks, and sum up what it has."""
+    if options.quick:
+        options = replace(options, n=min(options.n, 1), noise=min(options.noise, 1))
+    prior, results = load_prior(options.prior), results_of("out_of_model", options)
+    return resumed(
+        results,
+        options,
+        lambda: _measure(options, prior, results),
+        lambda: summary(newest(results.lines, prior.hash, options.seed), options),
+    )
+
+
+def _measure(options: Options, prior: Prior, results: Results) -> None:
+    config = ControllerConfig()
+    settings = {"digest": digest(asdict(config), options.quick)}
+    common = {"prior": prior.hash, "method": METHOD, "settings": settings, "seed": options.seed}
+    rate = base_rate(128 if options.quick else 1024, config=config.observe)
+    for condition, name, make in _views(options.n, options.noise, options.meshes):
+        line: Line = {**common, "condition": condition, "object": name}
+        if line in results:
+            continue
+        try:
+            view = make()
+            answered = _answered(view, prior, config, rate, options.seed)
+        except ValueError as error:
+            answered = {"refused": str(error)}
+        results.add({**line, **answered})
+        say(f"{condition}, {name}: " + json.dumps({k: v for k, v in answered.items() if not isinstance(v, list)}))
 
 
 def _views(n: int, noise: int, meshes: Path) -> Iterator[tuple[str, int | str, Callable[[], VesselView]]]:
@@ -155,9 +150,12 @@ def detection(
     return float(np.mean(strangers < bound)), float(below)
 
 
-def _rows(lines: Sequence[Line]) -> list[Row]:
-    rows, cells = [], []
+def summary(lines: list[Line], options: Options) -> Summary | None:
+    """Figures of the three conditions; None where one has no answers."""
     by = {c: [line for line in lines if line["condition"] == c and "refused" not in line] for c in CONDITIONS}
+    if not all(by.values()):
+        return None
+    rows = []
     for condition, own in by.items():
         values = {"flagged": float(np.mean([line["flagged"] for line in own]))}
         occupied = np.concatenate([line["occupied"] for line in own]).astype(bool)
@@ -169,28 +167,41 @@ def _rows(lines: Sequence[Line]) -> list[Row]:
             for check in CHECKS:
                 family, strangers = (np.array([line[check] for line in by[c]]) for c in (FAMILY, condition))
                 values[f"detected_at_5_{check}"], values[f"auc_{check}"] = detection(family, strangers)
-        rows += [Row("out_of_model", "tempered_smc", condition, k, v, "", len(own)) for k, v in values.items()]
+        rows += [Row("out_of_model", METHOD, condition, k, v, "", len(own)) for k, v in values.items()]
         nll = [line["hidden_nll_queried"] for line in own]
-        rows += mean_rows("out_of_model", "tempered_smc", condition, "hidden_nll", nll, "nats")
+        rows += mean_rows("out_of_model", METHOD, condition, "hidden_nll", nll, "nats")
         refused = sum(line["condition"] == condition for line in lines) - len(own)
-        rows.append(Row("out_of_model", "tempered_smc", condition, "refused", float(refused), "", len(own) + refused))
-        cells.append([f"{condition} ({len(own)}, {refused} refused)", f"{np.mean(nll):.3f}"])
-        cells[-1] += [f"{values[k]:.3f}" if k in values else "" for k in _SHOWN]
-    table("Strangers", ("condition", "hidden_nll", *_SHOWN), cells)
-    return rows
+        rows.append(Row("out_of_model", METHOD, condition, "refused", float(refused), "", len(own) + refused))
+    return Summary(rows, _tables(Figures(rows)), lambda: _draw(lines))
 
 
-_SHOWN = (
-    "flagged",
-    "falsely_free_alone",
-    "free_alone",
-    "falsely_free_queried",
-    "free_queried",
-    *(f"{measure}_{check}" for check in CHECKS for measure in ("detected_at_5", "auc")),
-)
+def _tables(of: Figures) -> list[Table]:
+    flags, boxes = [], []
+    for c in CONDITIONS:
+        named = f"{c} ({of.count(c, METHOD, 'flagged')}, {of(c, METHOD, 'refused'):.0f} refused)"
+        found = [
+            f"{of(c, METHOD, f'detected_at_5_{k}'):.0%} ({of(c, METHOD, f'auc_{k}'):.2f})" if c != FAMILY else ""
+            for k in CHECKS
+        ]
+        flags.append([named, f"{of(c, METHOD, 'flagged'):.1%}", *found, f"{of(c, METHOD, 'hidden_nll'):.3f}"])
+        called = []
+        for k in ("alone", "queried"):
+            wrong, free = of(c, METHOD, f"falsely_free_{k}"), of(c, METHOD, f"free_{k}")
+            called.append(f"{wrong:.2f} ({free:.1%})" if free else "none is called free")
+        wrong = of(c, METHOD, "falsely_free_queried")
+        boxes.append([named, called[0], gated(called[1], 0.0 if np.isnan(wrong) else wrong, most=0.05)])
+    checks = [f"found at 5% false alarms by the {title} (area under the curve)" for title in CHECKS.values()]
+    return [
+        Table("What is flagged", ("condition (objects)", "flagged", *checks, "hidden_nll, nats"), flags),
+        Table(
+            "Of boxes called free (0.95), those that are not (share called)",
+            ("condition (objects)", "by the hypotheses alone", "as a query answers, gate <= 0.05"),
+            boxes,
+        ),
+    ]
 
 
-def _draw(lines: Sequence[Line], path: Path) -> None:
+def _draw(lines: Sequence[Line]) -> Figure:
     """ROC of both checks; and where the share that is explained lies, with the shipped bound."""
     figure = Figure(figsize=(13, 4), layout="constrained")
     axes = figure.subplots(1, 3)
@@ -212,5 +223,4 @@ def _draw(lines: Sequence[Line], path: Path) -> None:
     axes[2].axvline(ControllerConfig().out_of_model_below, color="k", linewidth=0.8, label="flagged below")
     axes[2].set(title="share of pixels explained", ylabel="objects")
     axes[2].legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    return figure

@@ -17,16 +17,18 @@ p_occupied by itself, without the joint answer.
 
 import time
 from collections.abc import Callable
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
-from benchmarks.harness.intervals import mean_rows, paired_interval
-from benchmarks.harness.progress import say, table
+from benchmarks.harness.intervals import gap_rows, mean_rows, paired_interval
+from benchmarks.harness.progress import say
 from benchmarks.harness.results import refuse_cut
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import PriorTableOptions, Summary
+from benchmarks.harness.tables import Table, gated, ranged
 from benchmarks.measures.metrics import scored_voxels
 from benchmarks.measures.scores import random_boxes
 from benchmarks.scenes.conditions import ANY, views
@@ -87,16 +89,18 @@ def scores(p: Float[np.ndarray, "boxes"], free: Bool[np.ndarray, "boxes"]) -> di
     }
 
 
-def main(out: Path, quick: bool = False, prior: Path | None = None, n: int = 40, seed: int = 0) -> list[Row]:
-    """Whether unseen boxes are free, jointly and by independent voxels; the time that a query takes.
+@dataclass(frozen=True)
+class Options(PriorTableOptions):
+    """Whether unseen boxes are free, jointly and by independent voxels; the time that a query takes."""
 
-    Args:
-        prior: weights to use; the shipped ones by default
-        n: objects
-        seed: of the samplers
-    """
-    n = min(n, 2) if quick else n
-    loaded, rate = load_prior(prior), base_rate(128 if quick else 1024)
+    n: int = 40
+    """Objects."""
+
+
+def main(options: Options) -> Summary:
+    """Measure, and sum up."""
+    n, seed = min(options.n, 2) if options.quick else options.n, options.seed
+    loaded, rate = load_prior(options.prior), base_rate(128 if options.quick else 1024)
     every: list[tuple[dict[str, np.ndarray], np.ndarray]] = []
     h = None
     for number, view in views(ANY, n, lambda _: False):
@@ -113,21 +117,29 @@ def main(out: Path, quick: bool = False, prior: Path | None = None, n: int = 40,
         column = {metric: np.array([s[metric] for s in own]) for metric in own[0]}
         for metric in ("brier", "log_score"):
             rows += mean_rows("query", way, ANY, metric, column[metric], "nats" if metric == "log_score" else "")
-        gap = paired_interval(column["log_score"], np.array([s["log_score"] for s in by[JOINT]]))
-        for label, value in (("", gap.mean), ("_q025", gap.low), ("_q975", gap.high)):
-            rows.append(Row("query", way, ANY, f"log_score_above_joint{label}", float(value), "nats", gap.n))
+        pair = column["log_score"], np.array([s["log_score"] for s in by[JOINT]])
+        gap = paired_interval(*pair)
+        rows += gap_rows("query", way, ANY, "log_score_above_joint", *pair)
         called = float(column["called_free"].mean())
         wrong = float(column["wrong"].mean()) / max(called, 1e-9)
         rows += [Row("query", way, ANY, k, v, "", gap.n) for k, v in (("called_free", called), ("wrong", wrong))]
         cells.append([
             way, f"{column['brier'].mean():.3f}", f"{column['log_score'].mean():.3f}",
-            f"{gap.mean:+.3f} ({gap.low:+.3f}..{gap.high:+.3f})", f"{called:.3f}", f"{wrong:.3f}",
+            "" if way == JOINT else ranged(gap, sign="+"), gated(f"{wrong:.3f} ({called:.0%})", wrong, most=0.05),
         ])  # fmt: skip
-    header = ("way", "brier", "log score", "above the joint's, 95%", "called free", "of these not")
-    table(f"{BOXES * len(every)} unseen boxes, {len(every)} objects", header, cells)
-    rows += _times(h)
-    _draw(every, out / "query.png")
-    return rows
+    header = (
+        "way",
+        "brier",
+        "log score",
+        "above the joint one's",
+        "called free and not (share called), gate <= 0.05",
+    )
+    times = _times(h)
+    tables = [
+        Table(f"{BOXES * len(every)} unseen boxes, {len(every)} objects", header, cells),
+        Table("Median time", ("what", "ms"), [[row.metric, f"{row.value:.2f}"] for row in times]),
+    ]
+    return Summary([*rows, *times], tables, lambda: _draw(every))
 
 
 def _times(h: Hypotheses) -> list[Row]:
@@ -157,11 +169,10 @@ def _times(h: Hypotheses) -> list[Row]:
         rows.append(
             Row("query", JOINT, f"{len(h.weights)} hypotheses, {h.grid}^3", name, float(np.median(taken)), "ms", 21)
         )
-    table("Median time", ("what", "ms"), [[row.metric, f"{row.value:.2f}"] for row in rows])
     return rows
 
 
-def _draw(every: list[tuple[dict[str, np.ndarray], np.ndarray]], path: Path) -> None:
+def _draw(every: list[tuple[dict[str, np.ndarray], np.ndarray]]) -> Figure:
     """Reliability of p_free, and how often each probability is said."""
     figure = Figure(figsize=(10, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -179,5 +190,4 @@ def _draw(every: list[tuple[dict[str, np.ndarray], np.ndarray]], path: Path) -> 
     left.set(xlabel="probability that the box is free", ylabel="share that is", title="boxes in unseen space")
     right.set(xlabel="probability that the box is free", ylabel=f"boxes of {len(free)}")
     left.legend(fontsize=9)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    return figure

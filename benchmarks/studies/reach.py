@@ -17,15 +17,17 @@ over the scenes in which every belief found a way that did not collide.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
-from benchmarks.harness.progress import say, table
+from benchmarks.harness.intervals import PairedInterval
+from benchmarks.harness.progress import say
 from benchmarks.harness.results import refuse_cut
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import PriorTableOptions, Summary
+from benchmarks.harness.tables import Table, gated, ranged
 from benchmarks.scenes.conditions import ANY, views
 from benchmarks.scenes.vessels import GRID, VesselView
 from examples.reach import Gripper, Reach, choose, reaches
@@ -157,19 +159,21 @@ def tasks_of(belief: Belief, count: int, rng: np.random.Generator) -> list[Task]
     return found
 
 
-def main(
-    out: Path, quick: bool = False, prior: Path | None = None, n: int = 60, each: int = 50, seed: int = 0
-) -> list[Row]:
-    """Collisions against detours of a reaching planner, by what it believes of unseen space.
+@dataclass(frozen=True)
+class Options(PriorTableOptions):
+    """Collisions against detours of a reaching planner, by what it believes of unseen space."""
 
-    Args:
-        prior: weights to use; the shipped ones by default
-        n: objects
-        each: goals beside each
-        seed: of the samplers
-    """
-    n, each = (min(n, 2), min(each, 10)) if quick else (n, each)
-    loaded = load_prior(prior)
+    n: int = 60
+    """Objects."""
+    each: int = 50
+    """Goals beside each."""
+
+
+def main(options: Options) -> Summary:
+    """Measure, and sum up."""
+    n, each, seed = options.n, options.each, options.seed
+    n, each = (min(n, 2), min(each, 10)) if options.quick else (n, each)
+    loaded = load_prior(options.prior)
     by_object: list[list[Task]] = []
     for number, view in views(ANY, n, lambda _: False):
         assert view is not None
@@ -185,27 +189,15 @@ def main(
     scenes = sum(map(len, by_object))
     for belief in BELIEFS:
         mean, low, high = _means(by_object, belief, LEAST)
-        for k, name in enumerate(("collided", "no_way", "detour")):
-            for label, value in (("", mean), ("_q025", low), ("_q975", high)):
-                rows.append(
-                    Row(
-                        "reach",
-                        belief,
-                        f"least {LEAST:g}",
-                        name + label,
-                        float(value[k]),
-                        "m" if k == 2 else "",
-                        scenes,
-                    )
-                )
-        lines.append([belief, *(f"{m:.3f} ({a:.3f}..{b:.3f})" for m, a, b in zip(mean, low, high, strict=True))])
-    table(
-        f"{scenes} scenes about {len(by_object)} objects, least {LEAST:g}",
-        ("belief", "collided", "no way", "detour, m"),
-        lines,
-    )
-    _draw(by_object, out / "reach.png")
-    return rows
+        found = [PairedInterval(*ends, scenes) for ends in zip(mean, low, high, strict=True)]
+        for name, i in zip(("collided", "no_way", "detour"), found, strict=True):
+            for label, value in (("", i.mean), ("_q025", i.low), ("_q975", i.high)):
+                unit = "m" if name == "detour" else ""
+                rows.append(Row("reach", belief, f"least {LEAST:g}", name + label, float(value), unit, scenes))
+        lines.append([belief, gated(ranged(found[0]), found[0].mean, most=0.05), *map(ranged, found[1:])])
+    title = f"{scenes} scenes about {len(by_object)} objects, P(free) >= {LEAST:g}"
+    table = Table(title, ("belief", "collided, gate <= 0.05", "no way", "detour, m"), lines)
+    return Summary(rows, [table], lambda: _draw(by_object))
 
 
 def _means(
@@ -229,7 +221,7 @@ def _means(
     return means(np.arange(len(total))), low, high
 
 
-def _draw(by_object: list[list[Task]], path: Path) -> None:
+def _draw(by_object: list[list[Task]]) -> Figure:
     """Collisions against what caution costs: a curve over `least` where there are probabilities, else a point."""
     figure = Figure(figsize=(11, 4.8), layout="constrained")
     cost: tuple[Callable, ...] = (lambda m: m[1], lambda m: 100 * m[2])
@@ -246,5 +238,4 @@ def _draw(by_object: list[list[Task]], path: Path) -> None:
         ax.set(xlabel=label, ylabel="scenes in which it collided", ylim=(0, None))
     ax.legend(fontsize=9)
     figure.suptitle(f"{sum(map(len, by_object))} reaches beside {len(by_object)} objects; rings: least {LEAST:g}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    return figure

@@ -19,10 +19,10 @@ from matplotlib.figure import Figure
 
 from benchmarks.harness.progress import say
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import Summary, TableOptions
 from benchmarks.scenes.recording import noisy
 from perception.sources.frame import Frame
-from perception.sources.recorder import Recorder
-from perception.sources.settings import RecordConfig
+from perception.sources.recorder import RecordConfig, Recorder
 
 
 @dataclass(frozen=True)
@@ -35,16 +35,24 @@ class Cost:
     bytes_per_frame: float
 
 
-def main(out: Path, quick: bool = False, frames: int = 150) -> list[Row]:
-    """Record `frames` frames with every encoding, at most 20 with `quick`."""
-    count = min(frames, 20) if quick else frames
+@dataclass(frozen=True)
+class Options(TableOptions):
+    """What recording takes, with every encoding."""
+
+    frames: int = 150
+    """Frames that are recorded, at most 20 with --quick."""
+
+
+def main(options: Options) -> Summary:
+    """Measure, and sum up."""
+    out = options.out
+    count = min(options.frames, 20) if options.quick else options.frames
     source = noisy(count)
     costs = []
     for config in encodings():
         costs.append(measure(source, config, out))
         c = costs[-1]
         say(f"{c.name:12s} {c.frames_per_s:5.0f} frames/s, {c.cpu_ms:5.1f} ms CPU, {c.bytes_per_frame / 1e6:5.2f} MB")
-    draw(out / "record.png", costs)
     rows = []
     for c in costs:
         for metric, value, unit in (
@@ -53,7 +61,7 @@ def main(out: Path, quick: bool = False, frames: int = 150) -> list[Row]:
             ("bytes_per_frame", c.bytes_per_frame, "B"),
         ):
             rows.append(Row("record", c.name, "640x480, RGB-D", metric, value, unit, count))
-    return rows
+    return Summary(rows, picture=lambda: draw(costs))
 
 
 def encodings() -> list[RecordConfig]:
@@ -77,9 +85,9 @@ def measure(frames: Sequence[Frame], config: RecordConfig, folder: Path) -> Cost
         return Cost(f"{config.colour}, {config.compression}", n / seconds, 1e3 * cpu / n, recorder.bytes / n)
 
 
-def draw(path: Path, costs: Sequence[Cost]) -> None:
+def draw(costs: Sequence[Cost]) -> Figure:
     """Size against processor time: best is the lower left."""
-    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
+    figure = Figure(figsize=(6.4, 4.0), layout="constrained", dpi=120)
     axes = figure.subplots()
     marks = {"raw": "o", "png": "s", "jpeg": "^"}
     for c in costs:
@@ -92,4 +100,4 @@ def draw(path: Path, costs: Sequence[Cost]) -> None:
     axes.set_xlim(0.0, 1.25 * max(c.cpu_ms for c in costs))
     axes.set_ylim(0.0, 1.15 * max(c.bytes_per_frame for c in costs) / 1e6)
     axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=120)
+    return figure

@@ -22,7 +22,6 @@ Ranks are appended to a file, draw by draw, and what is there is not made again.
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -30,13 +29,15 @@ import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 
-from benchmarks.harness.progress import say, table
-from benchmarks.harness.results import FOLDER, Line, append_line, digest, key, read_lines
+from benchmarks.harness.progress import say
+from benchmarks.harness.results import Line, Results, digest, key
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import ResumedOptions, Summary, results_of, resumed, selected
+from benchmarks.harness.tables import Table, gated
 from benchmarks.measures.metrics import coverage, ks_distance, randomised_rank, uniform_band
 from probnerf.fields.base import Model
 from probnerf.fields.cylinder import CylinderModel
-from probnerf.inference import likelihood_of, likelihood_settings
+from probnerf.inference import InferConfig, likelihood_of, likelihood_settings
 from probnerf.likelihood.dispatch import log_likelihood
 from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.likelihood.position import pose_of
@@ -46,12 +47,10 @@ from probnerf.prior.checkpoint import load_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering.occupancy import solid, voxel_centres
 from probnerf.sampling.populations import thin
-from probnerf.sampling.tempered_smc import tempered_smc
-from probnerf.settings import InferConfig, TemperedSMCConfig
+from probnerf.sampling.tempered_smc import TemperedSMCConfig, tempered_smc
 from probnerf.shapes import opacity_grids
 from probnerf.types import POSE_SIZE, Posterior
 
-RESULTS = FOLDER / "sbc.jsonl"
 GRID = 24
 POSE_SIGMA = (0.08, 0.08, 0.06, 0.02, 0.03)  # of perception's usual widths, cube units
 STATISTICS = ("volume", "hidden", "voxel", "yaw", "delta", "log_likelihood")
@@ -162,56 +161,68 @@ def identity(condition: Condition, prior: str) -> Line:
     return {"prior": prior if condition.model is _prior else "", **same}
 
 
-def main(
-    out: Path,
-    quick: bool = False,
-    n: int = 200,
-    conditions: str = "",
-    results: Path = RESULTS,
-    only_chart: bool = False,
-) -> list[Row]:
-    """Simulation-based calibration of tempered SMC: ranks of the truth in draws from the model itself.
+@dataclass(frozen=True)
+class Options(ResumedOptions):
+    """Simulation-based calibration of tempered SMC: ranks of the truth in draws from the model itself."""
 
-    Args:
-        n: draws of each condition
-        conditions: only these, by name, separated by semicolons
-        results: file that ranks are appended to, and read from
-        only_chart: draw what the file holds
-    """
-    if quick:
-        n, results = min(n, 20), out / "sbc.jsonl" if results == RESULTS else results
-    wanted = [c.strip() for c in (conditions or ("cylinder" if quick else "")).split(";") if c.strip()]
-    chosen = [c for c in CONDITIONS if not wanted or c.name in wanted]
-    if len(chosen) < len(wanted):
-        raise ValueError(f"no condition {conditions!r}; there are: {'; '.join(c.name for c in CONDITIONS)}")
-    done = {key(line): line["ranks"] for line in read_lines(results)}
-    prior = load_prior(None).hash
+    n: int = 200
+    """Draws of each condition."""
+    conditions: str = ""
+    """Only these, by name, separated by semicolons."""
+
+
+def main(options: Options) -> Summary:
+    """Measure what the file lacks, and sum up what it has."""
+    if options.quick:
+        options = replace(options, n=min(options.n, 20))
+    names = selected(options.conditions, [c.name for c in CONDITIONS], "condition")
+    asked = [c for c in CONDITIONS if c.name in names]
+    results = results_of("sbc", options)
+    prior = load_prior(None).hash if any(c.model is _prior for c in asked) else ""
+    wanted = {key({**identity(c, prior), "object": number}) for c in asked for number in range(options.n)}
+    return resumed(
+        results,
+        options,
+        lambda: _measure(options, asked, prior, results),
+        lambda: summary([line for line in results.lines if key(line) in wanted], options),
+    )
+
+
+def _measure(options: Options, asked: list[Condition], prior: str, results: Results) -> None:
+    for condition in asked:
+        model = None
+        for number in range(options.n):
+            line: Line = {**identity(condition, prior), "object": number}
+            if line in results:
+                continue
+            model = model or condition.model()
+            ranks, posterior = ranks_of(condition, model, number)
+            rounded = {name: round(rank, 4) for name, rank in ranks.items()}
+            results.add({**line, "ranks": rounded, "result": posterior.result})
+            if (number + 1) % 20 == 0:
+                say(f"{condition.name}: {number + 1} of {options.n} draws ({posterior.result})")
+
+
+def summary(lines: list[Line], options: Options) -> Summary | None:
+    """Figures of every condition that has ranks; None where there are none."""
     found: dict[str, dict[str, np.ndarray]] = {}
-    for condition in chosen:
-        model, ranks, same = condition.model(), [], identity(condition, prior)
-        for seed in range(n):
-            line = {**same, "object": seed}
-            if key(line) not in done and not only_chart:
-                one, posterior = ranks_of(condition, model, seed)
-                done[key(line)] = {name: round(rank, 4) for name, rank in one.items()}
-                append_line(results, {**line, "ranks": done[key(line)], "result": posterior.result})
-                if (seed + 1) % 20 == 0:
-                    say(f"{condition.name}: {seed + 1} of {n} draws ({posterior.result})")
-            if key(line) in done:
-                ranks.append(done[key(line)])
-        if ranks:
+    for condition in CONDITIONS:
+        own = [line for line in lines if line["condition"] == condition.name]
+        own = sorted((x for x in own if x["settings"] == own[-1]["settings"]), key=lambda x: x["object"])
+        if own:
+            ranks = [line["ranks"] for line in own]
             found[condition.name] = {name: np.array([r[name] for r in ranks]) for name in ranks[0]}
     if not found:
-        raise ValueError(f"{results} has no ranks of these conditions; leave --only-chart")
-    rows, lines = [], []
+        return None
+    rows, cells = [], []
     for name, by in found.items():
         for statistic, u in by.items():
             values = {"outside": outside(u), "ks": ks_distance(u), "coverage90": coverage(u)}
             rows += [Row("sbc", name, statistic, metric, value, "", len(u)) for metric, value in values.items()]
-            lines.append([name, str(len(u)), statistic, *(f"{v:.3f}" for v in values.values())])
-    table("Ranks of the truth", ("condition", "draws", "statistic", "outside", "ks", "coverage90"), lines)
-    _draw(found, out / "sbc.png")
-    return rows
+            left = gated(f"{values['outside']:.3f}", values["outside"], most=0.0)
+            cells.append([name, str(len(u)), statistic, f"{values['coverage90']:.3f}", f"{values['ks']:.3f}", left])
+    header = ("condition", "draws", "statistic", "coverage90 (right: 0.9)", "ks", "outside the band, gate 0")
+    return Summary(rows, [Table("Ranks of the truth", header, cells)], lambda: _draw(found))
 
 
 def outside(ranks: Float[np.ndarray, "n"], level: float = 0.95) -> float:
@@ -221,7 +232,7 @@ def outside(ranks: Float[np.ndarray, "n"], level: float = 0.95) -> float:
     return float(max(0.0, np.max(low - share), np.max(share - high)))
 
 
-def _draw(found: dict[str, dict[str, np.ndarray]], path: Path) -> None:
+def _draw(found: dict[str, dict[str, np.ndarray]]) -> Figure:
     """Each condition's rank distribution functions, less the uniform one, with the band."""
     figure = Figure(figsize=(4.2 * min(3, len(found)), 3.4 * -(-len(found) // 3)), layout="constrained")
     axes = figure.subplots(-(-len(found) // 3), min(3, len(found)), squeeze=False, sharey=True)
@@ -239,5 +250,4 @@ def _draw(found: dict[str, dict[str, np.ndarray]], path: Path) -> None:
     axes[0, 0].set_ylabel("share of ranks below, less uniform")
     drawn = dict(pair for ax in axes.flat for pair in zip(*reversed(ax.get_legend_handles_labels()), strict=True))
     axes[0, 0].legend(drawn.values(), drawn.keys(), fontsize=7)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    return figure

@@ -11,29 +11,29 @@ Answers are appended to a file as they come, and what is there is not made again
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from benchmarks.harness.intervals import interval, paired_interval
-from benchmarks.harness.progress import say, table
-from benchmarks.harness.results import FOLDER, Line, append_line, digest, key, read_lines, refuse_cut
+from benchmarks.harness.intervals import Figures, gap_rows, interval
+from benchmarks.harness.progress import say
+from benchmarks.harness.results import Line, Results, digest, newest, objects_of, refuse_cut
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import PriorOptions, Summary, results_of, resumed
+from benchmarks.harness.tables import Table, between, gated
 from benchmarks.measures.metrics import falsely_free, scored_voxels
 from benchmarks.measures.scores import BOXES, as_queried, random_boxes, score
 from benchmarks.scenes.conditions import faultless_pictures
 from benchmarks.scenes.faults import AXES, Axis
 from benchmarks.scenes.vessels import VesselPicture, base_rate, vessel_view
-from perception.inference.controller import Estimate, estimate
-from perception.inference.settings import ControllerConfig
+from perception.inference.controller import ControllerConfig, Estimate, estimate
 from perception.inference.tracker import Tracker, Update
 from probnerf.prior.checkpoint import Prior, load_prior
 
-RESULTS = FOLDER / "stability.jsonl"
 SHIPS = "as it ships"
+METHOD = "tempered_smc"
 STAGES = 240  # at most, an answer
 
 
@@ -83,72 +83,86 @@ def look(
     return Seen(nll, h.out_of_model, p_free=tuple(judged.p_free.tolist()), occupied=tuple(judged.occupied.tolist()))
 
 
-def main(
-    out: Path,
-    quick: bool = False,
-    prior: Path | None = None,
-    n: int = 8,
-    axes: str = "",
-    seeds: int = 2,
-    results: Path = RESULTS,
-    only_chart: bool = False,
-) -> list[Row]:
-    """What one fault at a time, or too small a model, does to answers about unseen space.
+@dataclass(frozen=True)
+class Options(PriorOptions):
+    """What one fault at a time, or too small a model, does to answers about unseen space."""
 
-    Args:
-        prior: weights to use; the shipped ones by default
-        n: views
-        axes: only those whose name begins with one of these, separated by semicolons
-        seeds: of the sampler, for each view
-        results: file that answers are appended to, and read from
-        only_chart: draw what the file holds
-    """
-    if quick:
-        n, seeds, axes = 1, 1, axes or "occluded"
-        results = out / "stability.jsonl" if results == RESULTS else results
-    wanted = tuple(a.strip() for a in axes.split(";") if a.strip())
-    chosen = [a for a in AXES if not wanted or a.name.startswith(wanted)]
-    if not chosen:
-        raise ValueError(f"no axis begins with {axes!r}; there are: {'; '.join(a.name for a in AXES)}")
-    loaded, rate = load_prior(prior), base_rate(128 if quick else 1024)
-    settings = {"digest": digest(asdict(ControllerConfig()), quick)}
-    lines = read_lines(results)
-    kept = [line["settings"] for line in lines if line["prior"] == loaded.hash]
-    if only_chart and kept:  # the newest ones, which may be of other settings than today's
-        settings = kept[-1]
-    same = {"prior": loaded.hash, "method": "tempered_smc", "settings": settings}
-    done = {key(line): line for line in lines}
+    n: int = 8
+    """Views."""
+    axes: str = ""
+    """Only those whose name begins with one of these, separated by semicolons."""
+    seeds: int = 2
+    """Of the sampler, for each view: seed, seed + 1, ..."""
 
-    def answered(picture: VesselPicture, axis: Axis, amount: float, seed: int) -> Seen | None:
-        """From the file, or made and kept there; None where it may only be read."""
-        ships = amount == axis.amounts[0]
-        condition = SHIPS if ships else f"{axis.name} {amount:g}"
-        line: Line = {**same, "condition": condition, "object": picture.placed.seed, "seed": seed}
-        if key(line) not in done:
-            if only_chart:
-                return None
-            line |= {"seen": asdict(look(picture, axis, amount, loaded, rate, seed))}
-            append_line(results, line)
-            done[key(line)] = line
-        seen = done[key(line)]["seen"]
-        return Seen(**{**seen, "p_free": tuple(seen["p_free"]), "occupied": tuple(seen["occupied"])})
+    @property
+    def chosen(self) -> list[Axis]:
+        """The axes that are asked for. Raises ValueError where there is none."""
+        wanted = tuple(a.strip() for a in self.axes.split(";") if a.strip())
+        chosen = [a for a in AXES if not wanted or a.name.startswith(wanted)]
+        if not chosen:
+            raise ValueError(f"no axis begins with {self.axes!r}; there are: {'; '.join(a.name for a in AXES)}")
+        return chosen
 
-    views = faultless_pictures(n)
-    asked = [(seed, p) for seed in range(seeds) for p in views]
-    found: dict[str, list[list[Seen]]] = {}  # of each amount, seed by seed
-    for axis in chosen:
-        made = []
+
+def main(options: Options) -> Summary:
+    """Measure what the file lacks, and sum up what it has."""
+    if options.quick:
+        options = replace(options, n=1, seeds=1, axes=options.axes or "occluded")
+    _ = options.chosen  # a mistyped name is refused before anything is loaded
+    prior, results = load_prior(options.prior), results_of("stability", options)
+    return resumed(
+        results,
+        options,
+        lambda: _measure(options, prior, results),
+        lambda: summary(newest(results.lines, prior.hash), options),
+    )
+
+
+def _condition(axis: Axis, amount: float) -> str:
+    return SHIPS if amount == axis.amounts[0] else f"{axis.name} {amount:g}"
+
+
+def _measure(options: Options, prior: Prior, results: Results) -> None:
+    settings = {"digest": digest(asdict(ControllerConfig()), options.quick)}
+    same = {"prior": prior.hash, "method": METHOD, "settings": settings}
+    rate, views = base_rate(128 if options.quick else 1024), faultless_pictures(options.n)
+    for axis in options.chosen:
         for amount in axis.amounts:
-            made.append([s for seed, p in asked if (s := answered(p, axis, amount, seed)) is not None])
-            if made[-1]:
-                say(f"{axis.name} {amount:g}: " + _line(made[-1]))
-        if all(len(seen) == len(asked) for seen in made):
-            found[axis.name] = made
+            for seed in range(options.seed, options.seed + options.seeds):
+                for picture in views:
+                    own = {"condition": _condition(axis, amount), "object": picture.placed.seed, "seed": seed}
+                    if {**same, **own} not in results:
+                        seen = look(picture, axis, amount, prior, rate, seed)
+                        results.add({**same, **own, **asdict(seen)})
+                        say(f"{axis.name} {amount:g}, {picture.placed.seed}: {_line(seen)}")
+
+
+def _line(seen: Seen) -> str:
+    nll = "no answer" if seen.hidden_nll is None else f"{seen.hidden_nll:.3f} nats"
+    return f"{nll}{', flagged' * seen.flagged}" + f"; BROKEN: {seen.broken}" * bool(seen.broken)
+
+
+def _seen(line: Line) -> Seen:
+    values = {f.name: line[f.name] for f in fields(Seen)}
+    return Seen(**{**values, "p_free": tuple(values["p_free"]), "occupied": tuple(map(bool, values["occupied"]))})
+
+
+def summary(lines: list[Line], options: Options) -> Summary | None:
+    """Figures of the axes of which every amount was answered for the first `n` views; None where there is none."""
+    seeds = range(options.seed, options.seed + options.seeds)
+    views = objects_of([line for line in lines if line["condition"] == SHIPS])[: options.n]
+    by = {(line["condition"], line["object"], line["seed"]): _seen(line) for line in lines}
+    asked = [(view, seed) for seed in seeds for view in views]
+    found: dict[str, list[list[Seen]]] = {}  # of each amount, seed by seed
+    for axis in options.chosen:
+        keys = [[(_condition(axis, amount), *each) for each in asked] for amount in axis.amounts]
+        if len(views) == options.n and all(k in by for amount in keys for k in amount):
+            found[axis.name] = [[by[k] for k in amount] for amount in keys]
     if not found:
-        raise ValueError(f"{results} has not every amount of any of these axes for {n} views; leave --only-chart")
-    shown = [axis for axis in chosen if axis.name in found]
-    _draw(shown, found, n, out / "stability.png")
-    return _rows(shown, found, n)
+        return None
+    axes = [axis for axis in options.chosen if axis.name in found]
+    rows = _rows(axes, found, options.n)
+    return Summary(rows, _tables(axes, Figures(rows)), lambda: _draw(axes, found, options.n))
 
 
 def _nll(seen: Sequence[Seen]) -> Float[np.ndarray, "seeds_n"]:
@@ -174,45 +188,48 @@ def _falsely_free(seen: Sequence[Seen]) -> float:
     return falsely_free(p_free, occupied.astype(bool))
 
 
-def _line(seen: Sequence[Seen]) -> str:
-    flagged, broken = np.mean([s.flagged for s in seen]), [s.broken for s in seen if s.broken]
-    return f"{interval(_nll(seen)).mean:.3f} nats, flagged {flagged:.2f}" + "".join(f"; BROKEN: {b}" for b in broken)
-
-
 def _rows(axes: Sequence[Axis], found: dict[str, list[list[Seen]]], n: int) -> list[Row]:
-    rows, lines = [], []
+    rows = []
     for axis in axes:
         first = found[axis.name][0]
         for amount, seen in zip(axis.amounts, found[axis.name], strict=True):
-            gap = paired_interval(_by_view(seen, n), _by_view(first, n))
-            values = {
-                "hidden_nll": interval(_by_view(seen, n)).mean,
-                "hidden_nll_above_shipped": gap.mean,
-                "hidden_nll_above_shipped_q025": gap.low,
-                "hidden_nll_above_shipped_q975": gap.high,
+            of = (axis.name, f"{amount:g}")
+            nll, shipped = _by_view(seen, n), _by_view(first, n)
+            gaps = gap_rows("stability", *of, "hidden_nll_above_shipped", nll, shipped)
+            mean = interval(nll).mean
+            rows += [Row("stability", *of, "hidden_nll", mean, "nats", gaps[0].n), *gaps]
+            shares = {
                 "flagged": float(np.mean([s.flagged for s in seen])),
                 "falsely_free": _falsely_free(seen),
                 "called_free": float(sum(p > 0.95 for s in seen for p in s.p_free)),
                 "broken": float(np.mean([bool(s.broken) for s in seen])),
             }
+            rows += [Row("stability", *of, k, v, "", len(seen)) for k, v in shares.items()]
             if len(seen) > n:
-                values["between_seeds"] = _between_seeds(seen, n)
-            nats = {k for k in values if k.startswith("hidden_nll") or k == "between_seeds"}
-            rows += [
-                Row(
-                    "stability", axis.name, f"{amount:g}", k, v, "nats" * (k in nats), gap.n if k in nats else len(seen)
-                )
-                for k, v in values.items()
-            ]
-            lines.append([axis.name, f"{amount:g}", *(f"{v:.3f}" for v in values.values())])
-    short = (
-        name.replace("hidden_nll_above_shipped_", "").replace("hidden_nll_above_shipped", "above") for name in values
-    )
-    table("One thing made worse (above: how it ships, paired over views)", ("axis", "amount", *short), lines)
+                rows.append(Row("stability", *of, "between_seeds", _between_seeds(seen, n), "nats", gaps[0].n))
     return rows
 
 
-def _draw(axes: Sequence[Axis], found: dict[str, list[list[Seen]]], n: int, path: Path) -> None:
+def _tables(axes: Sequence[Axis], of: Figures) -> list[Table]:
+    lines = []
+    for axis in axes:
+        for amount in axis.amounts:
+            c, m = f"{amount:g}", axis.name
+            gap, broken = of.interval(c, m, "hidden_nll_above_shipped"), of(c, m, "broken")
+            above = f"{gap.mean:+.3f} ({between(gap, sign='+')})" if amount != axis.amounts[0] else ""
+            lines.append([
+                axis.name, c, f"{of(c, m, 'hidden_nll'):.3f}", above, f"{of(c, m, 'flagged'):.2f}",
+                f"{of(c, m, 'falsely_free'):.3f} of {of(c, m, 'called_free'):.0f}",
+                f"{of(c, m, 'between_seeds'):.3f}", gated(f"{broken:.3f}", broken, most=0.0),
+            ])  # fmt: skip
+    header = (
+        "axis", "amount", "hidden_nll, nats", "above as it ships, paired over views", "flagged",
+        "occupied, of boxes called free", "between seeds, nats", "broken, gate 0",
+    )  # fmt: skip
+    return [Table("One thing made worse", header, lines)]
+
+
+def _draw(axes: Sequence[Axis], found: dict[str, list[list[Seen]]], n: int) -> Figure:
     columns = min(4, len(axes))
     figure = Figure(figsize=(4.0 * columns, 3.0 * -(-len(axes) // columns)), layout="constrained")
     grid = figure.subplots(-(-len(axes) // columns), columns, squeeze=False)
@@ -249,5 +266,4 @@ def _draw(axes: Sequence[Axis], found: dict[str, list[list[Seen]]], n: int, path
         ax.set(title=axis.name, ylim=(0, 1.6))
         ax.title.set_fontsize(9)
     grid[0, 0].legend(fontsize=7)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    return figure

@@ -12,13 +12,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
 from benchmarks.harness.intervals import mean_rows
-from benchmarks.harness.progress import say, table
-from benchmarks.harness.rows import Row
+from benchmarks.harness.progress import say
+from benchmarks.harness.study import Summary, TableOptions
+from benchmarks.harness.tables import Table
 
 PARTS = ("imports", "prior", "programs", "whole")
 OBJECTS = ("first_object", "again")
@@ -58,24 +59,27 @@ def _started(cache: str) -> dict[str, float]:
     return json.loads(run.stdout.splitlines()[-1])
 
 
-def main(out: Path, quick: bool = False, n: int = 5) -> list[Row]:
-    """Seconds from a new process to a node that may open its camera.
+@dataclass(frozen=True)
+class Options(TableOptions):
+    """Seconds from a new process to a node that may open its camera."""
 
-    Args:
-        n: starts with a filled cache
-    """
+    n: int = 5
+    """Starts with a filled cache."""
+
+
+def main(options: Options) -> Summary:
+    """Measure, and sum up."""
     with tempfile.TemporaryDirectory() as cache:
         found = {EMPTY: [_started(cache)]}
         say(f"{EMPTY}: {found[EMPTY][0]['whole']:.1f} s")
-        found[FILLED] = [_started(cache) for _ in range(1 if quick else n)]
+        found[FILLED] = [_started(cache) for _ in range(1 if options.quick else options.n)]
     rows, lines = [], []
     for condition, starts in found.items():
         for part in (*PARTS, *OBJECTS):
             rows += mean_rows("startup", "node", condition, part, [s[part] for s in starts], "s")
         medians = (f"{np.median([s[part] for s in starts]):.1f}" for part in (*PARTS, *OBJECTS))
         lines.append([condition, str(len(starts)), *medians])
-    table("Seconds of a start, medians", ("condition", "starts", *PARTS, *OBJECTS), lines)
-    return rows
+    return Summary(rows, [Table("Seconds of a start, medians", ("condition", "starts", *PARTS, *OBJECTS), lines)])
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import __main__ as command
+from benchmarks.harness import study
 from benchmarks.harness.rows import Row, write_rows
 
 TOY = '''
@@ -14,19 +15,23 @@ TOY = '''
 
 More about it.
 """
-from pathlib import Path
+from dataclasses import dataclass
+from matplotlib.figure import Figure
 from benchmarks.harness.rows import Row
+from benchmarks.harness.study import Summary, TableOptions
 
-def main(out: Path, quick: bool = False, scale: float = 1.0, shape: Path | None = None) -> list[Row]:
-    """Measures a number.
+@dataclass(frozen=True)
+class Options(TableOptions):
+    """Measures a number."""
 
-    Args:
-        scale: what it is multiplied by
-    """
-    if scale < 0:
-        raise ValueError(f"scale is {scale}; give a positive number")
-    (out / "toy.png").write_bytes(b"")
-    return [Row("toy", "by hand", "quick" if quick else "full", "size", 3.0 * scale, "m", 7)]
+    scale: float = 1.0
+    """Factor of the number."""
+
+def main(options: Options) -> Summary:
+    if options.scale < 0:
+        raise ValueError(f"scale is {options.scale}; give a positive number")
+    row = Row("toy", "by hand", "quick" if options.quick else "full", "size", 3.0 * options.scale, "m", 7)
+    return Summary([row], picture=Figure)
 '''
 
 
@@ -44,15 +49,21 @@ def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "benchmarks.studies.toy", raising=False)
 
 
-def test_a_study_runs(toy: None, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_study_runs(
+    toy: None, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out, rows = tmp_path / "new" / "bench", tmp_path / "rows" / "toy.json"
-    assert command.main(["toy", "--scale", "2", "--quick", "--out", str(out), "--json", str(rows)]) == 0
+    monkeypatch.setattr(study, "FOLDER", tmp_path / "kept")
+    options = ["--scale", "2", "--quick", "--keep", "--out", str(out), "--json", str(rows)]
+    assert command.main(["toy", *options]) == 0
     said = capsys.readouterr().out
     assert "by hand" in said and " 6 " in said and str(rows) in said and str(out / "toy.png") in said
     assert json.loads(rows.read_text()) == [
         {"name": "toy", "method": "by hand", "condition": "quick", "metric": "size", "value": 6.0, "unit": "m", "n": 7}
     ]
     assert list(rows.parent.iterdir()) == [rows]
+    kept = study.kept_tables("toy")
+    assert kept is not None and "| by hand | quick | size | 6 | m | 7 |" in kept[2][0].markdown()
 
 
 def test_help_lists_studies_and_their_options(toy: None, capsys: pytest.CaptureFixture) -> None:
@@ -63,7 +74,7 @@ def test_help_lists_studies_and_their_options(toy: None, capsys: pytest.CaptureF
     with pytest.raises(SystemExit):
         command.main(["toy", "--help"])
     text = capsys.readouterr().out
-    assert "what it is multiplied by (default: 1.0)" in text and "Measures a number." in text
+    assert "Factor of the number. (default: 1.0)" in text and "Measures a number." in text
     assert "--quick" in text and "--json FILE" in text and "--out DIR" in text
 
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.harness.intervals import mean_rows
+from benchmarks.measures.rebuilt import VIEWS, see
 from benchmarks.measures.scores import Answer, random_boxes, shapes_at
 from benchmarks.rivals.quick import METHODS, POSTERIOR
 from benchmarks.scenes.vessels import GRID, base_rate, hidden_vessel, told_pose, vessel_picture, vessel_view
@@ -21,17 +21,15 @@ from benchmarks.studies.frame import (
     weighted_median,
 )
 from benchmarks.studies.hidden import judge
-from benchmarks.studies.prior import VIEWS, see
-from perception.inference.controller import estimate
-from perception.inference.settings import ControllerConfig
+from perception.inference.controller import ControllerConfig, estimate
 from perception.observation.segmentation import segment
-from perception.observation.settings import PlaneGuess
 from perception.observation.support_plane import heights
 from perception.observation.visibility import answered_voxels
+from perception.observation.without_depth import PlaneGuess
 from perception.sources.frame_folder import read_frame_folder
+from probnerf.inference import InferConfig, quick_smc
 from probnerf.prior.checkpoint import load_prior
 from probnerf.rendering.occupancy import coarsen, voxel_centres
-from probnerf.settings import InferConfig, quick_smc
 from probnerf.types import BASE_Z
 
 
@@ -178,12 +176,6 @@ def test_a_box_turns_with_its_object():
     model = TrueObject(np.array([[0.0, 0, 0], [0.3, 0.1, 0.1]]), T)
     inside = model.box_holds(np.array([[0.95, 0.25, 0.05], [1.25, 0.05, 0.05]]), 0.01)
     assert inside.tolist() == [True, False]
-
-
-def test_mean_rows_carry_their_interval():
-    mean, low, high = mean_rows("x", "m", "c", "score", [1.0, 2.0, np.nan, 3.0], "nats")
-    assert (mean.value, mean.n, low.metric, high.metric) == (2.0, 3, "score_q025", "score_q975")
-    assert low.value < 2.0 < high.value
 
 
 def test_free_points_of_the_real_frame_are_free_and_unseen(shared_data):

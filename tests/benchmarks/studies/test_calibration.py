@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.harness.results import append_line
+from benchmarks.harness.results import Results
 from benchmarks.measures.metrics import ECE_BINS, uniform_band
 from benchmarks.rivals.quick import METHODS, POSTERIOR, RivalConfig
 from benchmarks.scenes.conditions import BEHIND, SORTS
 from benchmarks.scenes.vessels import pixels_of_handle
 from benchmarks.studies.calibration import _answered_by_all, _settings, called_free, pooled_ece
-from benchmarks.studies.sbc import CONDITIONS, STATISTICS, identity, main, outside, ranks_of
-from perception.inference.settings import ControllerConfig
+from benchmarks.studies.sbc import CONDITIONS, STATISTICS, Options, identity, main, outside, ranks_of
+from perception.inference.controller import ControllerConfig
 
 
 def test_a_pooled_error_lets_objects_that_err_apart_cancel() -> None:
@@ -68,15 +68,16 @@ def test_the_band_holds_as_many_uniform_samples_as_it_says(n: int) -> None:
 
 
 def test_ranks_that_are_there_are_not_made_again(tmp_path: Path) -> None:
-    kept, ranks = tmp_path / "sbc.jsonl", np.linspace(0.05, 0.95, 4)
+    kept, ranks = Results(tmp_path / "sbc.jsonl"), np.linspace(0.05, 0.95, 4)
     for number, rank in enumerate(ranks):
-        append_line(kept, {**identity(CONDITIONS[0], "weights"), "object": number, "ranks": {"volume": rank}})
-    rows = main(tmp_path, n=4, conditions="cylinder", results=kept)  # nothing to make
-    assert {r.n for r in rows} == {4} and (tmp_path / "sbc.png").is_file()
+        kept.add({**identity(CONDITIONS[0], "weights"), "object": number, "ranks": {"volume": rank}})
+    found = main(Options(tmp_path, n=4, conditions="cylinder", results=kept.path))  # nothing to make
+    rows = found.rows
+    assert {r.n for r in rows} == {4} and found.picture().axes
     assert {r.metric: r.value for r in rows}["coverage90"] == 1.0
     assert len({str(identity(c, "weights")) for c in CONDITIONS}) == len(CONDITIONS)
-    with pytest.raises(ValueError, match="has no ranks of these conditions"):
-        main(tmp_path, n=4, conditions="shipped prior", results=kept, only_chart=True)
+    with pytest.raises(ValueError, match="has no results of this prior"):
+        main(Options(tmp_path, n=4, conditions="shipped prior", results=kept.path, only_chart=True))
 
 
 @pytest.mark.slow

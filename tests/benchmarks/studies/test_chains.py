@@ -1,6 +1,5 @@
 """Chains are told apart, and the spread of draws is that of their volumes."""
 
-import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,10 +7,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.harness.results import Results
 from benchmarks.rivals.methods import VI, settings_of
 from benchmarks.studies import chains
-from benchmarks.studies.chains import ANNEALED, COMPARED, CONDITION, FIXED, SMC, main, relative_spread, unexplained
-from perception.inference.settings import ControllerConfig
+from benchmarks.studies.chains import (
+    ANNEALED,
+    COMPARED,
+    CONDITION,
+    FIXED,
+    SMC,
+    Options,
+    main,
+    relative_spread,
+    unexplained,
+)
+from perception.inference.controller import ControllerConfig
 from probnerf.prior.checkpoint import load_prior
 
 
@@ -39,28 +49,28 @@ def test_the_file_is_summed_up(tmp_path: Path) -> None:
     """A stuck chain and draws that agree show in the rows."""
     prior, config = load_prior().hash, ControllerConfig()
     told = zip(COMPARED, ([0.02, 0.02], [0.02, 0.04], [0.02, 0.6], [0.02]), (0.3, 0.3, 0.5, 0.1), strict=True)
-    results = tmp_path / "chains.jsonl"
-    with results.open("w") as file:
-        for method, missed, spread in told:
-            for view in (1, 2):
-                line = {"prior": prior, "condition": CONDITION, "object": view, "seed": 0, "method": method.name}
-                found = {"unexplained": missed, "volume_sd": spread, "rounding": 0.001 * view}
-                file.write(json.dumps({**line, "settings": settings_of(method, config), **found}) + "\n")
-    with pytest.raises(ValueError, match="leave --only-chart"):
-        main(tmp_path, results=tmp_path / "none.jsonl", only_chart=True)
-    value = {(r.method, r.metric): r.value for r in main(tmp_path, n=2, results=results, only_chart=True)}
+    results = Results(tmp_path / "chains.jsonl")
+    for method, missed, spread in told:
+        for view in (1, 2):
+            line = {"prior": prior, "condition": CONDITION, "object": view, "seed": 0, "method": method.name}
+            found = {"unexplained": missed, "volume_sd": spread, "rounding": 0.001 * view}
+            results.add({**line, "settings": settings_of(method, config), **found})
+    with pytest.raises(ValueError, match="omit --only-chart"):
+        main(Options(tmp_path, results=tmp_path / "none.jsonl", only_chart=True))
+    summary = main(Options(tmp_path, n=2, results=results.path, only_chart=True))
+    value = {(r.method, r.metric): r.value for r in summary.rows}
     assert value[FIXED.name, "unexplained_worst"] == 0.6 and value[ANNEALED.name, "unexplained_worst"] == 0.04
     assert value[FIXED.name, "unexplained_sd"] == pytest.approx(0.29)
     assert value[VI.name, "volume_sd_above_smc"] == pytest.approx(-0.2)
     assert value[SMC.name, "rounding"] == pytest.approx(0.0015)
-    assert (tmp_path / "chains.png").stat().st_size > 10_000
+    assert summary.picture().axes
 
 
 @pytest.mark.slow
 def test_rounding_says_nothing_of_a_view(tmp_path: Path) -> None:
-    value = {r.metric: r.value for r in main(tmp_path, quick=True)}
+    value = {r.metric: r.value for r in main(Options(tmp_path, quick=True)).rows}
     assert value["rounding"] < 0.05  # nats, of differences that decide from a tenth on
     assert value["unexplained_worst"] < 0.1
     kept = (tmp_path / "chains.jsonl").read_text()
-    main(tmp_path, quick=True)
+    main(Options(tmp_path, quick=True))
     assert (tmp_path / "chains.jsonl").read_text() == kept  # not made again

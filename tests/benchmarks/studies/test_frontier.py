@@ -3,11 +3,9 @@
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
-from benchmarks.harness.results import append_line, key, read_lines
 from benchmarks.rivals.methods import CONDITIONS, FULL, METHODS
 from benchmarks.scenes.vessels import ViewConfig, base_rate, vessel_picture, vessel_view
 from benchmarks.studies import frontier
@@ -15,7 +13,6 @@ from benchmarks.studies.frontier_chart import draw_frontier
 from probnerf.objects.tabletop import part_distances
 
 VESSEL = 2_000_001
-LINE = {"prior": "p", "method": "m", "settings": {"a": 1, "b": 2}, "condition": "c", "object": 3, "seed": 0}
 
 
 @pytest.fixture(scope="module")
@@ -51,35 +48,6 @@ def test_the_truth_stands_in_each_view_s_own_cube(pictures):
     assert (views[0].seen & views[0].solid & views[0].near_handle).sum() > 5
 
 
-def test_a_last_line_that_was_cut_is_dropped_and_another_one_is_an_error(tmp_path: Path):
-    file = tmp_path / "results.jsonl"
-    assert read_lines(file) == []
-    append_line(file, LINE)
-    append_line(file, {**LINE, "object": 4})
-    whole = file.read_bytes()
-    for cut in (1, 20, len(whole) // 2 - 1):
-        file.write_bytes(whole[:-cut])
-        assert [line["object"] for line in read_lines(file)] == [3]
-        append_line(file, {**LINE, "object": 4})
-        assert file.read_bytes() == whole
-    file.write_bytes(b"{\n" + whole)
-    with pytest.raises(ValueError, match="line 1 is damaged"):
-        read_lines(file)
-
-
-def test_an_answer_that_was_cut_is_not_kept(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        append_line(tmp_path / "results.jsonl", {"result": "interrupted"})
-    assert not list(tmp_path.iterdir())
-    append_line(tmp_path / "results.jsonl", {"result": "converged"})
-    assert (tmp_path / "results.jsonl").read_text() == '{"result": "converged"}\n'
-
-
-def test_the_order_of_settings_makes_no_other_result():
-    assert key(LINE) == key({**LINE, "settings": {"b": 2, "a": 1}})
-    assert key(LINE) != key({**LINE, "settings": {"b": 2, "a": 2}})
-
-
 def _found(nll: float) -> dict:
     metrics = dict.fromkeys(("psnr_heldout", "psnr_heldout_of_mean", "psnr_given", "psnr_given_of_mean"), 20.0)
     costs = {"seconds": 2.0, "gflops": 50.0, "point_gradients": 1e6, "point_evaluations": 0.0}
@@ -111,11 +79,11 @@ def test_a_run_goes_on_where_it_was_cut(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(frontier, "vessel_view", view)
     monkeypatch.setattr(frontier, "_one", one)
     monkeypatch.setattr(frontier, "base_rate", lambda **_: None)
-    monkeypatch.setattr(frontier, "draw_frontier", lambda *_: None)
     out, file = tmp_path / "out", tmp_path / "results.jsonl"
 
     def run(**options):
-        return frontier.main(out, n=2, methods="map;paper 100x100;fixed*", results=file, **options)
+        asked = frontier.Options(out, n=2, methods="map;paper 100x100;fixed*", results=file, **options)
+        return frontier.main(asked).rows
 
     run()
     assert len(made) == 8 and made[-1] == ()  # cut
@@ -135,10 +103,9 @@ def test_a_run_goes_on_where_it_was_cut(tmp_path: Path, monkeypatch: pytest.Monk
     assert overall["hidden_nll_above_paper"].value == pytest.approx(0.22)  # of the vessel that all answered
     assert overall["hidden_nll"].n == 1 and overall["fewer_point_gradients"].value == overall["less_work"].value == 1.0
     assert not any(r.condition == frontier.OVER_ALL and r.method == "fixed 20x100" for r in rows)
-    draw_frontier([row for row in rows if row.condition == CONDITIONS[0]], out / "frontier.png")
-    assert cv2.imread(str(out / "frontier.png")) is not None
+    assert len(draw_frontier([row for row in rows if row.condition == CONDITIONS[0]]).axes) == 4
     with pytest.raises(ValueError, match="no method 'nothing'"):
-        frontier.main(out, methods="nothing", results=file)
+        frontier.main(frontier.Options(out, methods="nothing", results=file))
 
 
 def test_every_method_is_another_one():
@@ -151,7 +118,7 @@ def test_two_methods_answer_one_view(tmp_path: Path, monkeypatch: pytest.MonkeyP
     config = replace(frontier.ControllerConfig(), hypotheses=4)
     monkeypatch.setattr(frontier, "ControllerConfig", lambda: config)
     monkeypatch.setattr(frontier, "base_rate", lambda **_: base_rate(24))
-    rows = frontier.main(tmp_path, quick=True, methods="encoder;paper 10x10")
+    rows = frontier.main(frontier.Options(tmp_path, quick=True, methods="encoder;paper 10x10")).rows
     value = {(r.method, r.metric): r.value for r in rows}
     for method in ("encoder alone", "paper 10x10"):
         assert 0.0 < value[method, "hidden_nll"] < 3.0 and 5.0 < value[method, "psnr_heldout"] < 40.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.studies.next_view import CHOICES, FARTHEST, NONE, RANDOM, SUGGESTED, _rows, places
+from benchmarks.studies.next_view import CHOICES, FARTHEST, NONE, RANDOM, SUGGESTED, Options, places, summary
 from perception.answers.next_view import rank_views, ring_of_views
 from tests.perception.answers.test_next_view import HIDDEN
 
@@ -25,10 +25,9 @@ def test_only_objects_with_every_answer_count() -> None:
         return {"method": who, "object": number, "hidden_nll": value, "change": "view"}
 
     lines = [line(who, number, 0.1 * number + k) for k, who in enumerate(CHOICES) for number in (2, 1)]
-    rows, by = _rows([*lines, line(NONE, 3, 9.0)])
-    assert {who: values.tolist() for who, values in by.items()} == {
-        who: pytest.approx([0.1 + k, 0.2 + k]) for k, who in enumerate(CHOICES)
-    }
+    rows = summary([*lines, line(NONE, 3, 9.0)], Options()).rows
     value = {(r.method, r.metric): r.value for r in rows}
+    assert [value[who, "hidden_nll"] for who in CHOICES] == pytest.approx([0.15 + k for k in range(len(CHOICES))])
+    assert {r.n for r in rows} == {2} and summary(lines[:2], Options()) is None
     assert value[RANDOM, "hidden_nll_above_suggested"] == pytest.approx(1.0)
     assert value[SUGGESTED, "hidden_nll_above_suggested"] == 0.0

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.harness.results import append_line
+from benchmarks.harness.results import Results
 from benchmarks.scenes.meshes import enclosed, mesh_view
-from benchmarks.studies.out_of_model import CONDITIONS, FAMILY, detection, main
+from benchmarks.studies.out_of_model import CONDITIONS, FAMILY, Options, detection, main
 from probnerf.prior.checkpoint import load_prior
 
 
@@ -62,17 +62,18 @@ def test_detection_at_five_percent_and_area() -> None:
 
 
 def test_answers_that_are_there_are_not_made_again(box: Path, tmp_path: Path) -> None:
-    kept = tmp_path / "kept.jsonl"
+    kept = Results(tmp_path / "kept.jsonl")
     with pytest.raises(ValueError, match="no mesh"):
-        main(tmp_path, n=1, meshes=tmp_path, results=kept)
+        main(Options(tmp_path, n=1, meshes=tmp_path, results=kept.path))
     same = {"prior": load_prior().hash, "method": "tempered_smc", "settings": {}, "seed": 0}
     for condition in CONDITIONS:
         for number, fit in enumerate((0.9, 0.95) if condition == FAMILY else (0.5, 0.93)):
             told = {"explained": fit, "evidence": fit, "flagged": fit < 0.8, "hidden_nll_queried": 0.2}
             boxes = {"p_free_alone": [1.0, 0.9], "p_free_queried": [0.96, 0.5], "occupied": [0, 1]}
-            append_line(kept, {**same, "condition": condition, "object": number, **told, **boxes})
-    append_line(kept, {**same, "condition": CONDITIONS[1], "object": "flat", "refused": "too small"})
-    rows = {(r.condition, r.metric): r.value for r in main(tmp_path, results=kept, only_chart=True)}
-    assert (tmp_path / "out_of_model.png").is_file()
+            kept.add({**same, "condition": condition, "object": number, **told, **boxes})
+    kept.add({**same, "condition": CONDITIONS[1], "object": "flat", "refused": "too small"})
+    summary = main(Options(tmp_path, results=kept.path, only_chart=True))
+    rows = {(r.condition, r.metric): r.value for r in summary.rows}
+    assert summary.picture().axes
     assert rows[CONDITIONS[1], "detected_at_5_explained"] == 0.5 and rows[FAMILY, "flagged"] == 0.0
     assert rows[CONDITIONS[1], "refused"] == 1.0 and rows[FAMILY, "falsely_free_queried"] == 0.0

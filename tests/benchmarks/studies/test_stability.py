@@ -8,8 +8,8 @@ import pytest
 from benchmarks.scenes.conditions import PICTURES_BEGIN, any_view
 from benchmarks.scenes.faults import AXES, Axis, noise_frame, occlusion
 from benchmarks.scenes.vessels import base_rate, vessel_view
-from benchmarks.studies.stability import Seen, look, main
-from perception.inference.settings import ControllerConfig
+from benchmarks.studies.stability import Options, Seen, look, main
+from perception.inference.controller import ControllerConfig
 from perception.sources.frame import Frame
 from probnerf.objects.tabletop import TEST_SEEDS
 from probnerf.prior.checkpoint import load_prior
@@ -63,17 +63,17 @@ def test_answers_that_are_there_are_not_made_again(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr("benchmarks.studies.stability.look", looked)
     settings = {"n": 1, "seeds": 1, "axes": "occluded;flying", "results": tmp_path / "kept.jsonl"}
-    first = main(tmp_path, **settings)
+    first = main(Options(tmp_path, **settings)).rows
     assert len(asked) == 1 + 4 + 3  # as it ships once
-    again = main(tmp_path, **settings, only_chart=True)
+    again = main(Options(tmp_path, **settings, only_chart=True)).rows
     assert again == first and len(asked) == 8
     monkeypatch.setattr("benchmarks.studies.stability.ControllerConfig", lambda: ControllerConfig(runs=3))
-    assert main(tmp_path, **settings, only_chart=True) == first  # what the file holds, whatever ships by now
+    assert main(Options(tmp_path, **settings, only_chart=True)).rows == first  # whatever ships
     value = {(r.method, r.condition, r.metric): r.value for r in first}
     assert value["occluded, share", "0.6", "hidden_nll_above_shipped"] == pytest.approx(0.6)
     assert value["occluded, share", "0.6", "flagged"] == 1.0 and value["occluded, share", "0.3", "flagged"] == 0.0
-    with pytest.raises(ValueError, match="leave --only-chart"):
-        main(tmp_path, **{**settings, "n": 2}, only_chart=True)
+    with pytest.raises(ValueError, match="omit --only-chart"):
+        main(Options(tmp_path, **{**settings, "n": 2}, only_chart=True))
 
 
 def test_seeds_are_told_apart_from_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,7 +83,7 @@ def test_seeds_are_told_apart_from_views(tmp_path: Path, monkeypatch: pytest.Mon
         return Seen(scores.get((seed, amount), 0.2), False, p_free=(0.99,), occupied=(False,))
 
     monkeypatch.setattr("benchmarks.studies.stability.look", looked)
-    rows = main(tmp_path, n=2, seeds=2, axes="flying", results=tmp_path / "kept.jsonl")
+    rows = main(Options(tmp_path, n=2, seeds=2, axes="flying", results=tmp_path / "kept.jsonl")).rows
     row = {(r.condition, r.metric): r for r in rows}
     assert row["8", "hidden_nll"].value == pytest.approx(0.4) and row["8", "hidden_nll"].n == 2
     assert row["8", "between_seeds"].value == pytest.approx(np.std([0.3, 0.5], ddof=1))
