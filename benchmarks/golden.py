@@ -20,7 +20,8 @@ import tyro
 
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.hypotheses_file import load, save
-from perception.inference.controller import ControllerConfig, estimate
+from perception.inference.controller import estimate
+from perception.inference.settings import ControllerConfig
 from perception.inference.tracker import Tracker
 from perception.observation.segmentation import segment
 from perception.simulation.sample_recording import CAMERA, SCENE, SENSOR

@@ -19,9 +19,9 @@ import tyro
 from jaxtyping import Float
 
 from node.ros.bus import Bus
-from node.ros.bus_config import BusConfig
 from node.ros.messages import QUERY_REGION, header, make, pose
 from node.ros.services import SWEPT
+from node.ros.settings import BusConfig
 
 Way = TypeVar("Way")
 

@@ -17,10 +17,11 @@ from perception.answers.query import QueryResult
 from perception.answers.query import query as ask
 from perception.answers.regions import Box, Cells, Points, Region, Swept, read_mesh
 from perception.answers.scene import Scene
-from perception.inference.controller import ControllerConfig
 from perception.inference.scene import estimate_each
+from perception.inference.settings import ControllerConfig
 from perception.inference.tracker import Tracker
-from perception.observation.segmentation import Segment, SegmentConfig, segment
+from perception.observation.segmentation import Segment, segment
+from perception.observation.settings import SegmentConfig
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import write_frame_folder
 from perception.sources.open_source import open_source

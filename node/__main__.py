@@ -70,7 +70,7 @@ def _replay(args: Sequence[str]) -> int:
 
 def _live(args: Sequence[str]) -> int:
     def load() -> type:
-        from node.commands.live import LiveConfig
+        from node.commands.options import LiveConfig
 
         return LiveConfig
 

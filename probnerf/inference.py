@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Array
@@ -17,68 +16,16 @@ from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.networks import ProbNeRF
 from probnerf.prior.posterior_network import Picture, encoder_positions, even_yaws, guesses
 from probnerf.rendering import foam
-from probnerf.sampling.annealed_hmc import AnnealedHMCConfig, annealed_hmc
+from probnerf.sampling.annealed_hmc import annealed_hmc
 from probnerf.sampling.gaussian_mixture import GaussianMixture
 from probnerf.sampling.hmc import StageInfo
-from probnerf.sampling.modes import ModesConfig, mixture_of_modes
+from probnerf.sampling.modes import mixture_of_modes
 from probnerf.sampling.populations import start_from
-from probnerf.sampling.tempered_smc import TemperedSMCConfig, tempered_smc
+from probnerf.sampling.tempered_smc import tempered_smc
+from probnerf.settings import InferConfig, TemperedSMCConfig
 from probnerf.types import Diagnostics, Observation, Posterior, on_device
 
-Method = Literal["tempered_smc", "annealed_hmc"]
 _log_likelihood = program()(log_likelihood)
-
-
-def quick_smc(populations: int, particles: int) -> TemperedSMCConfig:
-    """What two CPU cores move in seconds; `TemperedSMCConfig()` is the one that the laws are tested on.
-
-    Populations count alike: what decides between modes, a few nats, is less than the likelihood's own error and the
-    error of the evidence's estimates.
-    """
-    return TemperedSMCConfig(
-        populations=populations,
-        particles=particles,
-        start_particles=8 * particles,
-        moves=1,
-        leapfrog_steps=3,
-        ess_target=0.4,
-        target_acceptance=0.65,
-        final_stages=1,
-        keep=1,
-        evidence_power=0.0,
-        least_moved=1.0,
-    )
-
-
-@dataclass(frozen=True)
-class InferConfig:
-    """Which sampler, how much of it, and the pixel likelihood's numbers."""
-
-    method: Method = "tempered_smc"
-    modes: ModesConfig = field(default_factory=ModesConfig)  # where tempered_smc begins
-    # From modes each of many small populations follows one or two to the end. From the prior few particles all descend
-    # from one or two starts, and lose the other modes.
-    smc: TemperedSMCConfig = field(default_factory=lambda: quick_smc(8, 8))
-    smc_from_prior: TemperedSMCConfig = field(default_factory=lambda: quick_smc(4, 48))
-    hmc: AnnealedHMCConfig = field(default_factory=AnnealedHMCConfig)
-    lattice: int = 32  # G: cubes per 2 units
-    extent: float = 1.1  # the lattice covers [-extent, extent]^3: an object may be larger than its guessed cube
-    below: float = 0.15  # and so much under the plane, for its height is uncertain
-    colour_sigma: float = 0.3  # s: what the prior cannot draw of a print or a band, too
-    wall_sigma: float = 0.05  # cube units: the model's own error in a wall's place; wide, for small misfits are shared
-    outlier: float = 0.01  # share of ranges from nowhere; small, for a lid over a visible cavity is no outlier
-    reach: float = 0.3  # cube units behind a measured range beyond which nothing is asked
-    # kappa: what one ray counts for, which stands for many pixels; with 1 validation objects' answers were too cautious
-    power: float = 2.0
-    encoder_starts: bool = True  # begin at the modes that the encoder's guesses climb to; otherwise at the prior
-    sample_delta: bool = False  # also infer the weights' perturbation delta
-
-    def __post_init__(self) -> None:
-        if self.lattice < 1 or not min(self.extent, self.colour_sigma, self.wall_sigma, self.power) > 0:
-            raise ValueError(
-                f"lattice {self.lattice} must be 1 or more, and extent {self.extent:g}, colour_sigma"
-                f" {self.colour_sigma:g}, wall_sigma {self.wall_sigma:g} and power {self.power:g} more than 0"
-            )
 
 
 def likelihood_settings(config: InferConfig, sample_pose: bool = True) -> Likelihood:

@@ -36,7 +36,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("coverage",),
     ),
     "probnerf": (
-        ("environment", "geometry", "types"),
+        ("environment", "geometry", "settings", "types"),
         ("kernel",),
         ("compile_cache", "fields"),
         ("rendering",),

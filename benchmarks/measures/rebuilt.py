@@ -26,7 +26,8 @@ from probnerf.prior.encoder_input import ENCODER_RADIUS, camera_features, encode
 from probnerf.prior.networks import ProbNeRF
 from probnerf.rendering import foam
 from probnerf.rendering.occupancy import coarsen, solid
-from probnerf.sampling.ascent import AdamConfig, ascend
+from probnerf.sampling.ascent import ascend
+from probnerf.settings import AdamConfig
 from probnerf.shapes import opacity_grids
 from probnerf.types import FREE, OBJECT, Observation, Rays
 

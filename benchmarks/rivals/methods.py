@@ -22,7 +22,8 @@ from benchmarks.harness.results import Line, digest
 from benchmarks.measures.scores import Answer, shapes_at
 from benchmarks.rivals.quick import RivalConfig, encoder_alone, encoder_picture
 from benchmarks.scenes.vessels import VesselView
-from perception.inference.controller import ControllerConfig, estimate
+from perception.inference.controller import estimate
+from perception.inference.settings import ControllerConfig
 from perception.observation.object_frame import ObjectFrame
 from perception.observation.rays import observe
 from perception.observation.visibility import answered_voxels
@@ -32,11 +33,11 @@ from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.checkpoint import Prior
 from probnerf.prior.posterior_network import Picture, guesses
-from probnerf.sampling.annealed_hmc import AnnealedHMCConfig
 from probnerf.sampling.map_estimate import map_estimate
 from probnerf.sampling.mean_field import VIConfig, mean_field
 from probnerf.sampling.modes import log_posterior
 from probnerf.sampling.populations import thin
+from probnerf.settings import AnnealedHMCConfig
 from probnerf.shapes import scaled_about
 from probnerf.types import Diagnostics, Observation, Posterior
 

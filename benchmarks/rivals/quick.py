@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 from benchmarks.harness.results import refuse_cut
 from benchmarks.measures.scores import Answer, shapes_at
 from benchmarks.scenes.vessels import GRID, VesselView
-from perception.inference.controller import ControllerConfig, estimate
+from perception.inference.controller import estimate
+from perception.inference.settings import ControllerConfig
 from perception.observation.encoder_crop import crop
 from perception.observation.object_frame import ObjectFrame
 from perception.observation.rays import observe

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from perception.inference.controller import ControllerConfig
+from perception.inference.settings import ControllerConfig
 from perception.sources.frame import Frame
-from probnerf.sampling.tempered_smc import TemperedSMCConfig
+from probnerf.settings import TemperedSMCConfig
 
 
 def intrinsics(frame: Frame, amount: float) -> Frame:

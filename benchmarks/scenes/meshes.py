@@ -15,8 +15,8 @@ from scipy import ndimage
 from benchmarks.scenes.vessels import FINE, GRID, VesselView, ViewConfig, in_table, simulated_camera, stand
 from calibration.camera import Camera
 from perception.observation.object_frame import object_frame
-from perception.observation.rays import ObserveConfig
 from perception.observation.segmentation import segment
+from perception.observation.settings import ObserveConfig
 from perception.observation.visibility import seen_voxels
 from perception.simulation.sensor_faults import sense
 from perception.simulation.simulated_camera import Picture, Scene, render

@@ -13,10 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
 from perception.observation.object_frame import ObjectFrame, object_frame
-from perception.observation.rays import ObserveConfig
 from perception.observation.segmentation import Segment, segment
+from perception.observation.settings import ObserveConfig, PlaneGuess
 from perception.observation.visibility import seen_voxels
-from perception.observation.without_depth import PlaneGuess
 from perception.simulation.sensor_faults import sense
 from perception.simulation.simulated_camera import Picture, Placed, Scene, place_camera, render, truth
 from perception.sources.frame import Frame

@@ -22,10 +22,10 @@ from benchmarks.harness.progress import say
 from benchmarks.harness.rows import Row
 from benchmarks.harness.study import Summary, TableOptions
 from node.ros.bus import Bus
-from node.ros.bus_config import BusConfig
 from node.ros.messages import QUERY_REGION, header, image_message, make
 from node.ros.parameters import serve_parameters
 from node.ros.services import POINTS, Answers
+from node.ros.settings import BusConfig
 from perception.answers.hypotheses import Hypotheses
 from perception.observation.object_frame import ObjectFrame
 from probnerf.rendering.occupancy import voxel_centres

@@ -43,7 +43,7 @@ from benchmarks.rivals.methods import PAPER, VI, Question, answer, settings_of
 from benchmarks.rivals.quick import ENCODER, MAP, METHODS, POSTERIOR, PRIOR, RivalConfig, answers
 from benchmarks.scenes.conditions import ANY, SORTS, views
 from benchmarks.scenes.vessels import VesselView, base_rate
-from perception.inference.controller import ControllerConfig
+from perception.inference.settings import ControllerConfig
 from probnerf.inference import likelihood_settings
 from probnerf.prior.checkpoint import Prior, load_prior
 

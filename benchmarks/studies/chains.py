@@ -40,7 +40,7 @@ from benchmarks.rivals.methods import (
 )
 from benchmarks.scenes.conditions import faultless_pictures
 from benchmarks.scenes.vessels import GRID, vessel_view
-from perception.inference.controller import ControllerConfig
+from perception.inference.settings import ControllerConfig
 from probnerf.inference import without_sizes
 from probnerf.likelihood.dispatch import log_likelihood, plain_log_likelihood
 from probnerf.prior.checkpoint import Prior, load_prior

@@ -33,7 +33,8 @@ from benchmarks.scenes.vessels import (
     simulated_camera,
     vessel_view,
 )
-from perception.inference.controller import ControllerConfig, Estimate, estimate
+from perception.inference.controller import Estimate, estimate
+from perception.inference.settings import ControllerConfig
 from perception.simulation.simulated_camera import Placed, Scene, render
 from probnerf.objects.tabletop import KINDS, TEST_SEEDS, TEXTURES
 from probnerf.prior.checkpoint import load_prior

@@ -39,7 +39,8 @@ from benchmarks.rivals.quick import warm_up
 from perception.answers.hypotheses import Hypotheses, surface_points
 from perception.answers.query import query
 from perception.answers.regions import Points
-from perception.inference.controller import ControllerConfig, Estimate, estimate
+from perception.inference.controller import Estimate, estimate
+from perception.inference.settings import ControllerConfig
 from perception.observation.segmentation import Segment, segment
 from perception.observation.support_plane import heights
 from perception.sources.frame import Frame

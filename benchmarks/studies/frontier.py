@@ -37,7 +37,7 @@ from benchmarks.measures.scores import BOXES, picture_psnr, random_boxes, score
 from benchmarks.rivals.methods import CONDITIONS, DEPTHS, FULL, METHODS, Method, Question, answer, settings_of
 from benchmarks.scenes.vessels import base_rate, vessel_picture, vessel_view
 from benchmarks.studies.frontier_chart import draw_frontier
-from perception.inference.controller import ControllerConfig
+from perception.inference.settings import ControllerConfig
 from probnerf.inference import without_sizes
 from probnerf.objects.tabletop import TEST_SEEDS
 from probnerf.prior.checkpoint import Prior, load_prior

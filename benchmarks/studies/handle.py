@@ -32,7 +32,7 @@ from benchmarks.measures.scores import BOXES, random_boxes, score
 from benchmarks.rivals.methods import CONTROLLER, FROM_PRIOR, METHODS, Question, answer, settings_of
 from benchmarks.scenes.conditions import BEHIND, views
 from benchmarks.scenes.vessels import GRID, base_rate
-from perception.inference.controller import ControllerConfig
+from perception.inference.settings import ControllerConfig
 from perception.simulation.simulated_camera import Placed
 from probnerf.fields.base import Model
 from probnerf.inference import likelihood_settings

@@ -31,7 +31,7 @@ from benchmarks.measures.metrics import coverage, falsely_free, ks_distance, sco
 from benchmarks.measures.scores import BOXES, Answer, random_boxes, score
 from benchmarks.rivals.quick import METHODS, POSTERIOR, RivalConfig, answers, warm_up
 from benchmarks.scenes.vessels import VesselView, base_rate, hidden_vessel
-from perception.inference.controller import ControllerConfig
+from perception.inference.settings import ControllerConfig
 from probnerf.objects.tabletop import TEST_SEEDS
 from probnerf.prior.checkpoint import load_prior
 

@@ -37,7 +37,7 @@ from perception.observation.segmentation import segment
 from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.recording import Log
 from probnerf.fields.mlp import MLPField, encoded_size
-from probnerf.inference import InferConfig, likelihood_of, with_sizes
+from probnerf.inference import likelihood_of, with_sizes
 from probnerf.kernel import library
 from probnerf.likelihood import kernel_call
 from probnerf.likelihood.dispatch import log_likelihood, plain_log_likelihood
@@ -45,6 +45,7 @@ from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.prior.checkpoint import load_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering.foam import FAR
+from probnerf.settings import InferConfig
 from probnerf.types import OBJECT, Observation, joined
 
 

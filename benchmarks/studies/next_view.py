@@ -30,7 +30,7 @@ from benchmarks.scenes.conditions import any_view
 from benchmarks.scenes.vessels import GRID, VesselPicture, VesselView, base_rate, vessel_view
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.next_view import rank_views, ring_of_views
-from perception.inference.controller import ControllerConfig
+from perception.inference.settings import ControllerConfig
 from perception.inference.tracker import Tracker
 from perception.observation.segmentation import segment
 from perception.simulation.sensor_faults import sense

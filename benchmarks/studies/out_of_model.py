@@ -40,7 +40,8 @@ from benchmarks.scenes.conditions import any_view
 from benchmarks.scenes.faults import noise_frame
 from benchmarks.scenes.meshes import mesh_view
 from benchmarks.scenes.vessels import GRID, VesselView, base_rate, vessel_view
-from perception.inference.controller import ControllerConfig, estimate
+from perception.inference.controller import estimate
+from perception.inference.settings import ControllerConfig
 from perception.sources.frame import Frame
 from probnerf.objects.tabletop import TEST_SEEDS
 from probnerf.prior.checkpoint import Prior, load_prior

@@ -29,7 +29,7 @@ from benchmarks.measures.rebuilt import GRID, VIEWS, GateConfig, Rebuilt, rebuil
 from probnerf.objects.tabletop import TEST_SEEDS
 from probnerf.prior.checkpoint import load_prior
 from probnerf.prior.networks import ProbNeRF
-from probnerf.sampling.ascent import AdamConfig
+from probnerf.settings import AdamConfig
 
 PSNR_DB, IOU, RECALLED = 25.0, 0.8, 0.9  # the gate
 

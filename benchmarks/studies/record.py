@@ -22,7 +22,8 @@ from benchmarks.harness.rows import Row
 from benchmarks.harness.study import Summary, TableOptions
 from benchmarks.scenes.recording import noisy
 from perception.sources.frame import Frame
-from perception.sources.recorder import RecordConfig, Recorder
+from perception.sources.recorder import Recorder
+from perception.sources.settings import RecordConfig
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from benchmarks.harness.tables import Table, gated
 from benchmarks.measures.metrics import coverage, ks_distance, randomised_rank, uniform_band
 from probnerf.fields.base import Model
 from probnerf.fields.cylinder import CylinderModel
-from probnerf.inference import InferConfig, likelihood_of, likelihood_settings
+from probnerf.inference import likelihood_of, likelihood_settings
 from probnerf.likelihood.dispatch import log_likelihood
 from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.likelihood.position import pose_of
@@ -47,7 +47,8 @@ from probnerf.prior.checkpoint import load_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering.occupancy import solid, voxel_centres
 from probnerf.sampling.populations import thin
-from probnerf.sampling.tempered_smc import TemperedSMCConfig, tempered_smc
+from probnerf.sampling.tempered_smc import tempered_smc
+from probnerf.settings import InferConfig, TemperedSMCConfig
 from probnerf.shapes import opacity_grids
 from probnerf.types import POSE_SIZE, Posterior
 

@@ -28,7 +28,8 @@ from benchmarks.measures.scores import BOXES, as_queried, random_boxes, score
 from benchmarks.scenes.conditions import faultless_pictures
 from benchmarks.scenes.faults import AXES, Axis
 from benchmarks.scenes.vessels import VesselPicture, base_rate, vessel_view
-from perception.inference.controller import ControllerConfig, Estimate, estimate
+from perception.inference.controller import Estimate, estimate
+from perception.inference.settings import ControllerConfig
 from perception.inference.tracker import Tracker, Update
 from probnerf.prior.checkpoint import Prior, load_prior
 

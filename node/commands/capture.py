@@ -20,7 +20,7 @@ from calibration.turntable import Turntable, TurntableConfig
 from calibration.turntable_pose import PlateNotFoundError, PlatePose, locate_plate, plate_axis, turned
 from node.options import Capture
 from perception.observation.turntable_views import (
-    MaskConfig,
+    PlateMaskConfig,
     Square,
     bounds_by_carving,
     bounds_by_depth,
@@ -226,15 +226,15 @@ def _mask(
     view: Square, pose: PlatePose, frame: Frame, board: Board, background: np.ndarray | None
 ) -> Bool[np.ndarray, "s s"]:
     if view.depth is not None:
-        return mask_by_depth(view, pose.T_plate_camera, board, MaskConfig())
+        return mask_by_depth(view, pose.T_plate_camera, board, PlateMaskConfig())
     if background is None:
-        return mask_by_picture(view, pose.T_plate_camera, board, None, MaskConfig())
+        return mask_by_picture(view, pose.T_plate_camera, board, None, PlateMaskConfig())
     empty = Frame(background, None, frame.camera, frame_id=frame.frame_id)
     try:
         where = locate_plate(board, empty.camera, empty.rgb).T_plate_camera
     except PlateNotFoundError as error:
         raise ValueError(f"--background: {error}") from None
-    return mask_by_picture(view, pose.T_plate_camera, board, (square(empty), where), MaskConfig())
+    return mask_by_picture(view, pose.T_plate_camera, board, (square(empty), where), PlateMaskConfig())
 
 
 def _write_intrinsics(session: Session, board: Board, bounds: np.ndarray | None) -> None:

@@ -4,7 +4,8 @@ from rich.console import Console
 
 from node.options import Record
 from perception.sources.playback import open_playback
-from perception.sources.recorder import RecordConfig, Recorder
+from perception.sources.recorder import Recorder
+from perception.sources.settings import RecordConfig
 from perception.sources.topics import TopicNames
 
 

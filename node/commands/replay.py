@@ -17,17 +17,18 @@ from node.figures.object_figure import draw_object
 from node.figures.summary import figures, warnings
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.hypotheses_file import frame_path, hypotheses_path, load, save
-from perception.inference.controller import ControllerConfig, Estimate, estimate
-from perception.inference.tracker import TrackConfig
-from perception.observation.segmentation import Segment, SegmentConfig, segment
+from perception.inference.controller import Estimate, estimate
+from perception.inference.settings import ControllerConfig, TrackConfig
+from perception.observation.segmentation import Segment, segment
+from perception.observation.settings import SegmentConfig
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import write_frame_folder
 from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.playback import frame_at
 from perception.sources.topics import TopicNames
-from probnerf.inference import Method
 from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.sampling.hmc import StageInfo
+from probnerf.settings import Method
 
 BUDGET_S = 90.0
 PICTURE_S = 3.0  # of each object's share of the budget, kept back for its picture

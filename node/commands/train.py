@@ -27,6 +27,7 @@ from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering import foam
 from probnerf.training import elbo as training
 from probnerf.training.pictures import ViewSet, draw_views
+from probnerf.training.settings import TrainConfig
 from probnerf.training.srn_dataset import read_views
 from probnerf.training.surface_samples import Solids, draw_solids
 
@@ -51,7 +52,7 @@ class Training:
     --pictured are not read."""
     pictures: int | None = None
     """Pictures of each of them; 8 by default, or all with --data."""
-    recipe: training.TrainConfig = field(default_factory=training.TrainConfig)
+    recipe: TrainConfig = field(default_factory=TrainConfig)
 
 
 def train(options: Training, out: Console, err: Console) -> bool:

@@ -8,9 +8,9 @@ from typing import Any
 from rich.console import Console
 
 from node.ros.bus import Bus
-from node.ros.bus_config import BusConfig
 from node.ros.messages import HYPOTHESES, hypotheses_from
-from node.ros.topic_source import TopicConfig, TopicSource
+from node.ros.settings import BusConfig, TopicConfig
+from node.ros.topic_source import TopicSource
 from node.viewer.scene3d import CameraView, camera_view
 from perception.answers.hypotheses import Hypotheses
 from perception.sources.frame import Frame

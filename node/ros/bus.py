@@ -17,10 +17,10 @@ from typing import Any, Self
 import zenoh
 import zenoh.ext
 
-from node.ros.bus_config import BusConfig
 from node.ros.message_counts import Counts, Rate
 from node.ros.messages import decode, encode, make, type_hash
 from node.ros.rmw_zenoh import Node, attachment, gid, key, quality, read_attachment
+from node.ros.settings import BusConfig
 
 _HEARTBEAT_S = 0.5  # by which a late joiner notices that it missed a latched sample; as rmw_zenoh_cpp has it
 _SENDERS = 256  # whose sequence numbers are remembered

@@ -3,38 +3,17 @@
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 from node.ros.bus import Bus
+from node.ros.settings import TopicConfig
 from perception.sources.frame import Frame
 from perception.sources.ros_images import stamp_ns, to_camera, to_depth, to_rgb
 from perception.sources.stamp_matcher import Match, StampMatcher
-from perception.sources.topics import doubt, frame_of, is_rectified, named_otherwise, not_aligned, other_camera
+from perception.sources.topic_names import is_rectified
+from perception.sources.topics import doubt, frame_of, not_aligned, other_camera
 
 _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
-
-
-@dataclass(frozen=True)
-class TopicConfig:
-    """Where a camera driver publishes. A colour topic whose name ends in /compressed carries CompressedImage."""
-
-    colour: str = "/camera/color/image_raw"
-    depth: str | None = "/camera/aligned_depth_to_color/image_raw"  # aligned to colour; None: frames without depth
-    info: str = "/camera/color/camera_info"
-    rectified: bool | None = None  # the images are: the camera is that of the info's P, without distortion; None: as
-    # the colour topic's name says, by a part rect or rectified
-    aligned: bool = False  # depth is aligned to colour though its frame_id is another
-    tolerance_ms: float = 10.0  # between the stamps of colour and depth
-    silence_s: float = 2.0  # without a frame, after which a note says so
-    end_s: float | None = None  # without a frame, after which the source ends; None: never
-    waiting: int = 10  # colour images that wait for their depth, at most
-
-    def __post_init__(self) -> None:
-        if not (self.tolerance_ms >= 0 and self.silence_s > 0 and self.waiting >= 1):
-            raise ValueError("tolerance_ms must not be negative, silence_s be positive, and waiting be 1 or more")
-        if self.depth is not None and (word := named_otherwise(self.depth)):
-            raise ValueError(f"topic: depth is {self.depth}, whose name says {word}; give the camera's depth image")
 
 
 class TopicSource:

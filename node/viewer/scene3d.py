@@ -13,10 +13,10 @@ from node.figures import voxel_renderer
 from perception.answers.hypotheses import FrameName, Hypotheses, binary_entropy, by_weight, mesh
 from perception.answers.query import QueryResult, query
 from perception.answers.regions import Box, Points
-from perception.inference.tracker import TrackConfig
+from perception.inference.settings import TrackConfig
 from perception.observation.object_frame import object_frame
-from perception.observation.rays import ObserveConfig
 from perception.observation.segmentation import Segment, backproject, segment
+from perception.observation.settings import ObserveConfig
 from perception.sources.frame import Frame
 from probnerf.rendering.occupancy import voxel_centres
 from probnerf.types import BASE_Z

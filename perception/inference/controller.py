@@ -22,23 +22,15 @@ import numpy as np
 from jaxtyping import Array
 
 from perception.answers.hypotheses import Hypotheses
-from perception.inference.publish import PublishConfig, View, published
+from perception.inference.publish import View, published
+from perception.inference.settings import ControllerConfig
 from perception.observation.encoder_crop import crop
 from perception.observation.object_frame import ObjectFrame
-from perception.observation.rays import ObserveConfig, observe
+from perception.observation.rays import observe
 from perception.observation.segmentation import Segment
 from perception.observation.visibility import seen_voxels
 from perception.sources.frame import Frame
-from probnerf.inference import (
-    InferConfig,
-    asks_encoder,
-    crossings_of,
-    encoder_guess,
-    infer,
-    likelihood_of,
-    modes_of,
-    sampler_of,
-)
+from probnerf.inference import asks_encoder, crossings_of, encoder_guess, infer, likelihood_of, modes_of, sampler_of
 from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.checkpoint import Prior
 from probnerf.prior.networks import ProbNeRF
@@ -46,39 +38,11 @@ from probnerf.prior.posterior_network import Picture
 from probnerf.sampling.gaussian_mixture import GaussianMixture
 from probnerf.sampling.hmc import StageInfo
 from probnerf.sampling.populations import pooled
-from probnerf.sampling.tempered_smc import TemperedSMCConfig
+from probnerf.settings import TemperedSMCConfig
 from probnerf.types import Observation, Posterior
 
 # Two batches of eigenvalues may wait for each other for ever: each holds a thread of XLA's pool, one per core, until
 _ONE_AT_A_TIME = RLock()  # another thread of that pool has done its parts (jaxlib's ParallelBatchMap)
-
-
-@dataclass(frozen=True)
-class ControllerConfig(PublishConfig):
-    """What is inferred at most, when less is enough, and how finely it is published."""
-
-    infer: InferConfig = field(default_factory=InferConfig)  # of one run
-    observe: ObserveConfig = field(default_factory=ObserveConfig)
-    first_hypotheses: int = 8  # published while better ones are under way
-    unexplained: float = 0.1  # share of pixels above which all runs are made
-    tolerance: float = 0.005  # nats a voxel of unseen space that having no more populations may lose
-    runs: int = 4  # at most
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if min(self.first_hypotheses, self.runs) < 1:
-            raise ValueError(f"first_hypotheses {self.first_hypotheses} and runs {self.runs} must be 1 or more")
-        if not (self.tolerance >= 0.0 and 0.0 <= self.unexplained <= 1.0):
-            raise ValueError(f"tolerance {self.tolerance:g} must be 0 or more, unexplained {self.unexplained:g} 0 to 1")
-
-    def needed(self, done: int, loss: float, missed: float) -> int:
-        """How many runs the answer takes, if `done` of them leave this expected loss and share of pixels missed."""
-        if missed > self.unexplained:
-            return self.runs
-        if loss <= self.tolerance or np.isposinf(self.tolerance):  # whatever it loses, known or not
-            return done
-        wanted = done * loss / self.tolerance if self.tolerance > 0 and np.isfinite(loss) else np.inf
-        return int(min(self.runs, max(done + 1, np.ceil(min(wanted, self.runs)))))
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from perception.answers.hypotheses import Hypotheses
+from perception.inference.settings import PublishConfig
 from perception.observation.object_frame import ObjectFrame
 from perception.observation.segmentation import Segment
 from perception.observation.visibility import answered_voxels
@@ -18,21 +19,6 @@ from probnerf.prior.checkpoint import Prior
 from probnerf.sampling.populations import thin
 from probnerf.shapes import explained, opacity_grids, poses, scaled_about
 from probnerf.types import BASE_Z, Observation, Posterior
-
-
-@dataclass(frozen=True)
-class PublishConfig:
-    """How finely an answer is given."""
-
-    hypotheses: int = 48  # shapes published
-    grid: int = 64  # voxels per axis, G
-    out_of_model_below: float = 0.90  # share of telling pixels explained on average; validation objects: 0.91 and more
-
-    def __post_init__(self) -> None:
-        if self.hypotheses < 1:
-            raise ValueError(f"hypotheses is {self.hypotheses}; give 1 or more")
-        if not 1 <= self.grid <= 512:
-            raise ValueError(f"grid is {self.grid}; give 1 to 512")
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
-from perception.inference.controller import ControllerConfig, Estimate, estimate
+from perception.inference.controller import Estimate, estimate
+from perception.inference.settings import ControllerConfig
 from perception.observation.segmentation import Segment
 from perception.sources.frame import Frame
 from probnerf.prior.checkpoint import Prior

@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from perception.answers.hypotheses import Hypotheses
-from perception.inference.controller import ControllerConfig, infer_view
+from perception.inference.controller import infer_view
 from perception.inference.publish import View
+from perception.inference.settings import ControllerConfig, TrackConfig
 from perception.observation.object_frame import ObjectFrame, object_frame
 from perception.observation.rays import observe
 from perception.observation.segmentation import Segment
@@ -32,25 +33,6 @@ from probnerf.shapes import explained
 from probnerf.types import BASE_Z, Observation, Posterior, joined, on_device
 
 Change = Literal["new", "view", "continued", "same", "moved"]
-
-
-@dataclass(frozen=True)
-class TrackConfig:
-    """When a frame counts as a further view of an object, and when as another place of it."""
-
-    views: int = 3  # kept of each object; a further one takes the place of the nearest
-    apart: float = 15.0  # degrees between the directions of two views; one from nearer by takes the other's place
-    adds: float = 0.08  # share of the unseen space above the plane that a frame must see first; noise sees 0.01 to 0.03
-    checked: int = 32  # hypotheses that a frame is held against: the best of them counts
-    moved_below: float = 0.8  # share of telling pixels explained by the best of them under which the object has moved
-    reach: float = 0.6  # half extents; without a label map the object nearer than this is the same one
-    plane_degrees: float = 2.0  # without T_world_camera the camera stands still while its plane does, to so much
-    plane_m: float = 0.01
-    objects: int = 16  # remembered; of more, those inferred longest ago are forgotten
-
-    def __post_init__(self) -> None:
-        if min(self.views, self.checked) < 1:
-            raise ValueError(f"views {self.views} and checked {self.checked} must be 1 or more")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,31 +1,15 @@
 """Objects' pixels in colour alone: in a box that somebody drew, or by what a picture of the empty scene lacks."""
 
-from dataclasses import dataclass
-from pathlib import Path
-
 import cv2
 import numpy as np
 from jaxtyping import Bool, Int32, UInt8
 from scipy import ndimage
 
+from perception.observation.settings import MaskConfig
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import colour_to_rgb, read_png
 
 _SQUARE = np.ones((3, 3), bool)
-
-
-@dataclass(frozen=True)
-class MaskConfig:
-    """Where objects' pixels come from without depth: the box, else the background, else the frame's label map."""
-
-    box_px: tuple[int, int, int, int] | None = None  # x0 y0 x1 y1 about one whole object, the last two beyond it
-    before: tuple[tuple[int, int, int, int], ...] = ()  # boxes of things that may stand before what is in the box
-    background: Path | None = None  # PNG of the same scene from the same place without the objects
-    difference: float = 8.0  # of CIELAB colours (lightness counts half: shadows) beyond which a pixel has changed
-    margin: float = 0.5  # of the box's sides: how much around it shows what is behind
-    iterations: int = 5  # of GrabCut
-    band: int = 3  # px each side of the outline that say nothing
-    least: int = 200  # px of what is an object
 
 
 def label_colour(frame: Frame, config: MaskConfig) -> Int32[np.ndarray, "h w"]:

@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from calibration.camera import Camera
 from perception.observation.segmentation import Segment, backproject
+from perception.observation.settings import ObjectFrameConfig
 from perception.observation.support_plane import heights
 from perception.observation.visible_extent import visible_body
 from perception.observation.without_depth import standing_body
@@ -16,20 +17,6 @@ from probnerf.types import BASE_Z, OBJECT
 
 # The larger of a body's width and height is this many cube units: the scale convention of the prior.
 BODY_EXTENT = 1.4
-
-
-@dataclass(frozen=True)
-class ObjectFrameConfig:
-    """How a cube is put about an object, and how well its place and size count as known."""
-
-    xy_sigma: float = 0.08  # cube units; prior width of the body's axis about the guess
-    log_scale_sigma: float = 0.06
-    hidden_sigma: float = 0.3  # added to all widths, times the share of the outline that is hidden or cut off
-    side_sigma: float = 0.08  # added to all widths where the camera does not look down on the top
-    rim_reach: float = 0.02  # m; a rim pixel this near its neighbour inside the outline is of the object
-    outline_px: int = 5  # px from the outline within which something nearer hides what goes on
-    min_height: float = 0.02  # m; the tabletop's range of sizes
-    max_side: float = 0.40  # m
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,27 +7,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
 
 from calibration.camera import Camera
-from perception.observation.object_frame import ObjectFrame, ObjectFrameConfig, object_frame
+from perception.observation.object_frame import ObjectFrame, object_frame
 from perception.observation.segmentation import Segment
+from perception.observation.settings import ObserveConfig
 from perception.sources.frame import Frame
 from probnerf.types import FREE, OBJECT, UNKNOWN, Observation, Rays, on_device
 
 NO_LIMIT = 1e3  # cube units: a ray that misses the object without an end
-
-
-@dataclass(frozen=True)
-class ObserveConfig(ObjectFrameConfig):
-    """How a segment becomes an Observation. Ray counts are fixed, so that no frame compiles anew."""
-
-    colour_rays: int = 32  # OBJECT pixels
-    free_rays: int = 26  # FREE pixels, half of them near the outline
-    occluder_rays: int = 6  # UNKNOWN pixels that see something nearer
-    range_sigma_a: float = 1.0e-3  # m; sigma of a range d: a + b d^2
-    range_sigma_b: float = 2.0e-3  # 1/m
-    cube: float = 1.2  # half side (cube units) of the box that a ray must meet to be worth asking
-    outline_band: float = 0.25  # cube units either side of the mask that count as near its outline
-    range_offset_sigma: float = 0.005  # m; bias that all ranges of a view share
-    plane_sigma: float = 0.005  # m; of the plane's height, which a sensor measures at a grazing angle
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 With depth the plane is measured. Without, it is supposed (`PlaneGuess`) and colour finds the objects (`MaskConfig`).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -12,37 +12,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from perception.observation.colour_masks import MaskConfig, label_colour
-from perception.observation.support_plane import PlaneConfig, heights, horizontal, noise_growth, over, support_plane
-from perception.observation.without_depth import PlaneGuess, slopes, supposed_plane
+from perception.observation.colour_masks import label_colour
+from perception.observation.settings import SegmentConfig
+from perception.observation.support_plane import heights, horizontal, noise_growth, over, support_plane
+from perception.observation.without_depth import slopes, supposed_plane
 from perception.sources.frame import Frame
 from probnerf.types import FREE, OBJECT, UNKNOWN
 
 _SQUARE = np.ones((3, 3), bool)
-
-
-@dataclass(frozen=True)
-class SegmentConfig:
-    """Lengths in metres; heights are above the support plane."""
-
-    plane: PlaneConfig = field(default_factory=PlaneConfig)
-    above: float = 0.008  # points higher than this stand on the plane (within 1 m; see `noise_growth`)
-    base: float = 0.003  # lower pixels next to an object belong to it down to here (likewise)
-    max_height: float = 0.5  # higher points are not on a tabletop
-    voxel: float = 0.006  # points up to two voxels apart are one object
-    depth_step: float = 0.02  # pixels whose 3x3 neighbours on objects span more depth are on an outline
-    lifted: float = 0.02  # an object that ends higher than this may stand on another object
-    min_height: float = 0.02  # of what is found without a label map
-    min_pixels: int = 50  # a smaller mask says nothing about a shape
-    min_cluster_pixels: int = 200
-    rim: int = 2  # px each side of a mask's outline that say nothing: mixed pixels, misregistered depth
-    mask: MaskConfig = field(default_factory=MaskConfig)  # without depth
-    guess: PlaneGuess = field(default_factory=PlaneGuess)  # without depth
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, float | int) and not 0 <= value < np.inf:
-                raise ValueError(f"{name} is {value:g}; give 0 or more")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,21 +1,10 @@
 """The plane that things stand on, found in a frame's points."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
-
-@dataclass(frozen=True)
-class PlaneConfig:
-    """Lengths in metres; those marked * hold up to 1 m from the camera and grow with `noise_growth` beyond."""
-
-    tolerance: float = 0.008  # * half thickness of the slab that counts as the plane
-    lowest: float = 0.016  # * what stands on a plane has points higher than this
-    highest: float = 0.5  # and lower than this
-    triplets: int = 1000  # planes tried
-    seed: int = 0
+from perception.observation.settings import PlaneConfig
 
 
 def noise_growth(points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "..."]:

@@ -20,7 +20,7 @@ _PX_PER_SQUARE = 40
 
 
 @dataclass(frozen=True)
-class MaskConfig:
+class PlateMaskConfig:
     """What tells the object from what is around it."""
 
     lowest: float = 0.006  # m above the plate; what is lower is the plate's, as depth errs by millimetres
@@ -75,7 +75,7 @@ def plate_points(view: Square, T_plate_camera: Float[np.ndarray, "4 4"]) -> Floa
 
 
 def mask_by_depth(
-    view: Square, T_plate_camera: Float[np.ndarray, "4 4"], board: Board, config: MaskConfig
+    view: Square, T_plate_camera: Float[np.ndarray, "4 4"], board: Board, config: PlateMaskConfig
 ) -> Bool[np.ndarray, "s s"]:
     """What stands over the board, higher than `lowest`."""
     x, y, z = np.moveaxis(plate_points(view, T_plate_camera), -1, 0)
@@ -90,7 +90,7 @@ def mask_by_picture(
     T_plate_camera: Float[np.ndarray, "4 4"],
     board: Board,
     empty: tuple[Square, Float[np.ndarray, "4 4"]] | None,
-    config: MaskConfig,
+    config: PlateMaskConfig,
 ) -> Bool[np.ndarray, "s s"]:
     """What differs from the empty plate.
 
@@ -184,7 +184,7 @@ def _on_board(board: Board, to_pixels: Float[np.ndarray, "3 3"], shape: tuple[in
     return cv2.fillConvexPoly(np.zeros(shape, np.uint8), corners, 1).astype(bool)
 
 
-def _largest(mask: Bool[np.ndarray, "s s"], config: MaskConfig) -> Bool[np.ndarray, "s s"]:
+def _largest(mask: Bool[np.ndarray, "s s"], config: PlateMaskConfig) -> Bool[np.ndarray, "s s"]:
     """The largest connected piece, without specks and with small gaps closed."""
     kernel = np.ones((config.speck, config.speck), np.uint8)
     clean = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from calibration.camera import Camera
+from perception.observation.settings import PlaneGuess
 from perception.sources.frame import Frame
 from probnerf.types import FREE
 
@@ -19,29 +20,6 @@ _ROUND, _ANGULAR = (0.03, 0.0, 0.0), (0.30, 0.06, 0.12)
 _NOT_ROUND = 0.07  # rms deviation of the foot's outline from an arc, of its radius; cartons: more, others: less
 _STEEPEST = 4.0  # slope of the nearest point of the foot (76 degrees), beyond which a picture shows no height
 _MOST = 0.5  # relative error of the distance that still is a guess
-
-
-@dataclass(frozen=True)
-class PlaneGuess:
-    """The plane that things stand on where no depth measures it: from the camera's height and tilt, or its pose."""
-
-    camera_height: float | None = None  # m over the table; with `tilt`, and then the camera's pose is not read
-    tilt: float | None = None  # degrees of the optical axis below the horizon; the picture's rows are level
-    table: float = 0.0  # m; the table's height in the world frame, where the camera's pose in it is known
-    height_sigma: float = 0.01  # m; standard deviation of the camera's height over the table
-    tilt_sigma: float = 1.0  # degrees; of its tilt
-
-    def __post_init__(self) -> None:
-        if (self.camera_height is None) != (self.tilt is None):
-            missing = "tilt" if self.tilt is None else "camera_height"
-            raise ValueError(f"{missing} is missing; give both, camera_height in metres and tilt in degrees")
-        if self.camera_height is not None and not 0 < self.camera_height < np.inf:
-            raise ValueError(f"camera_height is {self.camera_height:g} m; give metres above the table, more than 0")
-        if self.tilt is not None and not -90 <= self.tilt <= 90:
-            raise ValueError(f"tilt is {self.tilt:g}; give degrees of the optical axis below the horizon, -90 to 90")
-        for name in ("height_sigma", "tilt_sigma"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise ValueError(f"{name} is {getattr(self, name):g}; give a standard deviation, 0 or more")
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from perception.sources.frame import SATURATED, Frame, known_counts
 from perception.sources.ros_images import MM, POSE_TOPIC
 from perception.sources.schedule_entry import SCHEDULE_TOPIC, Scheduled
+from perception.sources.settings import RecordConfig
 
 _TYPES = get_typestore(Stores.ROS2_HUMBLE)
 _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
@@ -30,33 +31,6 @@ _POSE, _STRING = "geometry_msgs/msg/PoseStamped", "std_msgs/msg/String"
 _COLOUR_OUT, _INFO_OUT, _LABEL_OUT = (f"/camera/color/{name}" for name in ("image_raw", "camera_info", "label"))
 _DEPTH_OUT = "/camera/aligned_depth_to_color/image_raw"
 _COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
-
-
-@dataclass(frozen=True)
-class RecordConfig:
-    """How frames are encoded, and how much a killed recorder may lose.
-
-    Processor time and size of a frame of 640x480 with a sensor's noise, roughly, on a busy core: 12 ms and 1.2 MB raw
-    with lz4 (8 and 1.5 with none, 23 and 0.8 with zstd), 18 ms and 0.7 MB with PNG, 7 ms and 0.3 MB with JPEG; depth
-    as PNG would take longer than zstd for the same size. `farside bench record` measures it.
-    """
-
-    colour: Literal["raw", "png", "jpeg"] = "raw"  # of a JPEG the hypotheses differ from those made live
-    jpeg_quality: int = 95
-    # exact: 16UC1 where the depth is whole millimetres, else 32FC1; millimetres: always 16UC1, 0 beyond 65 m
-    depth: Literal["exact", "millimetres"] = "exact"
-    compression: Literal["none", "lz4", "zstd"] = "lz4"  # of the chunks
-    chunk_bytes: int = 8 << 20  # before compression
-    flush_s: float = 0.5
-    waiting: int = 60  # frames and messages that may wait for the writer: two seconds of a camera
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.jpeg_quality <= 100:
-            raise ValueError(f"jpeg_quality is {self.jpeg_quality}; give 1 to 100")
-        if not self.flush_s > 0 or min(self.chunk_bytes, self.waiting) < 1:
-            raise ValueError(
-                f"flush_s {self.flush_s:g}, chunk_bytes {self.chunk_bytes} and waiting {self.waiting} must be positive"
-            )
 
 
 @dataclass(frozen=True)

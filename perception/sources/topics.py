@@ -5,7 +5,6 @@ and color), by the frame_id of their first message and by what the first depth i
 it might be meant is named in a note.
 """
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,14 +14,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from perception.sources.ros_images import COLOURS, encoding_of, samples, to_depth
+from perception.sources.topic_names import NO_DEPTH_PARTS, name_parts
 
 _COLOUR_PARTS = {"color", "colour", "rgb"}
 _LABEL_PARTS = {"label", "labels", "segmentation"}
-# A depth camera's other images, and those of this node.
-_NO_DEPTH_PARTS = {
-    *("confidence", "uncertainty", "variance", "covariance", "sigma", "std", "stddev", "error", "noise", "quality"),
-    *("disparity", "amplitude", "intensity", "probability", "mask", "weight", "weights", "normal", "normals"),
-}
 _NO_PICTURE_PARTS = {"confidence", "uncertainty", "mask", "disparity", "depth"}
 _INFRARED_PARTS = {"ir", "infra", "infrared", "thermal"}
 _LABEL_ENCODINGS = ("mono8", "8UC1", "mono16", "16UC1")
@@ -49,16 +44,6 @@ class Chosen:
     notes: tuple[str, ...]
 
 
-def name_parts(topic: str) -> set[str]:
-    """The words of a topic's name, in small letters, parted at everything that is no letter."""
-    return set(re.findall("[a-z]+", topic.lower()))
-
-
-def is_rectified(topic: str) -> bool:
-    """Whether an image topic's name says that its images are rectified."""
-    return bool({"rect", "rectified"} & name_parts(topic))
-
-
 def frame_of(message: Any) -> str:
     """The frame_id, without the leading slash of ROS 1; empty where the driver gives none."""
     return message.header.frame_id.lstrip("/")
@@ -74,11 +59,6 @@ def not_aligned(depth: Any, colour: Any) -> str | None:
     """The words that tell of depth of another camera than colour's; None where frame_id does not differ."""
     a, b = frame_of(depth), frame_of(colour)
     return f"is of frame {a!r} but colour is of frame {b!r}, so it is not aligned" if a and b and a != b else None
-
-
-def named_otherwise(topic: str) -> str | None:
-    """The part of a topic's name that says that its images are no depth."""
-    return next(iter(sorted(_NO_DEPTH_PARTS & name_parts(topic))), None)
 
 
 def doubt(depth: Float32[np.ndarray, "h w"]) -> str | None:
@@ -179,7 +159,7 @@ def _named_depth(path: Path, images: Mapping[str, Any]) -> tuple[list[str], list
     found, unsaid = [], []
     for topic, message in images.items():
         parts, encoding = name_parts(topic), encoding_of(message)
-        if encoding not in ("16UC1", "mono16", "32FC1") or parts & (_LABEL_PARTS | _NO_DEPTH_PARTS):
+        if encoding not in ("16UC1", "mono16", "32FC1") or parts & (_LABEL_PARTS | NO_DEPTH_PARTS):
             continue
         if "depth" in parts or "compressedDepth" in getattr(message, "format", ""):
             found.append(topic)

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -12,31 +11,8 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from probnerf.sampling.hmc import HMCState, LogLikelihood, StageInfo, Target, hmc_step, split_r_hat
+from probnerf.settings import AnnealedHMCConfig
 from probnerf.types import Diagnostics, Posterior
-
-
-@dataclass(frozen=True)
-class AnnealedHMCConfig:
-    """The paper's schedule. It names neither start nor base step: chains start at the prior, the step is tuned."""
-
-    chains: int = 8
-    iterations: int = 100
-    leapfrog_steps: int = 100
-    s_start: float = 5.0  # observation noise scale at the first iteration ...
-    s_end: float = 0.1  # ... and at the last: the scale that the log-likelihood was written for
-    keep: int = 16  # last states of each chain that become samples
-    step_per_scale: float = 0.05  # step size divided by s_t
-    tune_iterations: int = 20  # over these, step_per_scale follows the acceptance; then it is fixed (0: never tuned)
-    target_acceptance: float = 0.8
-
-    def __post_init__(self) -> None:
-        if not (self.chains >= 1 and self.leapfrog_steps >= 1 and self.step_per_scale > 0):
-            raise ValueError("AnnealedHMCConfig: chains, leapfrog_steps and step_per_scale must be positive")
-        if not 1 <= self.keep <= self.iterations:
-            raise ValueError(f"AnnealedHMCConfig: keep {self.keep} must lie between 1 and iterations {self.iterations}")
-        if not 0 < self.s_end <= self.s_start:
-            raise ValueError(f"AnnealedHMCConfig: need 0 < s_end <= s_start, got {self.s_end} and {self.s_start}")
-
 
 MAX_ANNEALED_STEP = 1.0  # radians: a turn of the prior beyond it is never useful
 

@@ -1,7 +1,6 @@
 """Climbing from many starts at once: Adam on a batch of positions."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -10,24 +9,10 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
+from probnerf.settings import AdamConfig
+
 # (shared arguments, this step's data, positions [p, d]) -> values [p]
 Objective = Callable[[Any, Any, Array], Array]
-
-
-@dataclass(frozen=True)
-class AdamConfig:
-    """Adam with a cosine schedule; rates are in units of the latents' prior standard deviation."""
-
-    steps: int = 300
-    learning_rate: float = 0.05
-    final_learning_rate: float = 0.002
-
-    def __post_init__(self) -> None:
-        if self.steps < 1 or not 0 < self.final_learning_rate <= self.learning_rate:
-            raise ValueError(
-                f"steps {self.steps} must be 1 or more, and the learning rate may only fall,"
-                f" from {self.learning_rate:g} to {self.final_learning_rate:g}"
-            )
 
 
 @partial(jax.jit, static_argnames=("objective", "config"))

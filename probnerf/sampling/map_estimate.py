@@ -13,8 +13,9 @@ from jaxtyping import Array, Float
 from probnerf.fields.base import Model
 from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.likelihood.settings import Likelihood
-from probnerf.sampling.ascent import AdamConfig, ascend
+from probnerf.sampling.ascent import ascend
 from probnerf.sampling.modes import log_posterior
+from probnerf.settings import AdamConfig
 from probnerf.types import Observation
 
 

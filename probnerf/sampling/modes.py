@@ -7,8 +7,6 @@ their mixture to the posterior: q(x)^(1 - beta) posterior(x)^beta. A share of it
 limit of many particles the answer does not depend on the mixture; what a finite number finds does.
 """
 
-from dataclasses import dataclass, field
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -17,8 +15,9 @@ from probnerf.compile_cache import program
 from probnerf.fields.base import Model
 from probnerf.likelihood.dispatch import log_likelihood
 from probnerf.likelihood.settings import Likelihood
-from probnerf.sampling.ascent import AdamConfig, ascend
+from probnerf.sampling.ascent import ascend
 from probnerf.sampling.gaussian_mixture import GaussianMixture
+from probnerf.settings import ModesConfig
 from probnerf.types import Observation
 
 # what `model.log_likelihood` takes
@@ -26,33 +25,6 @@ Args = tuple[Model, Likelihood, Observation, Float[Array, "n m"]]
 
 # The yaw's latents (a, b) = r (cos, sin) with any r: r^2 / 2 is exponential, so that r has mean 1.25, deviation 0.66.
 _RADIUS, _RADIUS_SIGMA = 1.25, 0.66
-
-
-@dataclass(frozen=True)
-class ModesConfig:
-    """How many starts climb how far, and what is laid about where they end."""
-
-    starts: int = 24  # at even yaws (where the pose is known: draws)
-    screen: AdamConfig = field(default_factory=lambda: AdamConfig(steps=30, final_learning_rate=0.05))  # of all starts
-    climb: AdamConfig = field(default_factory=lambda: AdamConfig(steps=30))  # of the better one of each two neighbours
-    difference: float = 0.03  # of positions, for second derivatives
-    widen: float = 2.0  # factor on the likelihood's variances: weights of a reference that is too narrow run away
-    power: float = 0.5  # a Gaussian's share is its mode's evidence (Laplace) to this power
-    prior_share: float = 0.1
-    unknown: float = 0.15  # share of the encoder's picture that says nothing above which it is not asked (`modes_of`)
-
-    def gradients(self, dim: int) -> float:
-        """Gradients of whole positions of `dim` numbers that climbs and second derivatives take."""
-        return float(self.starts * self.screen.steps + self.starts // 2 * (self.climb.steps + 1 + dim))
-
-    def __post_init__(self) -> None:
-        good = min(self.difference, self.widen, self.prior_share) > 0 and self.prior_share < 1
-        if self.starts < 2 or self.starts % 2 or not (good and 0 <= self.power <= 1):
-            raise ValueError(
-                f"starts {self.starts} must be even and 2 or more, difference {self.difference:g} and widen"
-                f" {self.widen:g} more than 0, power {self.power:g} from 0 to 1, prior_share {self.prior_share:g}"
-                " between 0 and 1"
-            )
 
 
 def log_posterior(args: tuple, _: None, positions: Float[Array, "p d"]) -> Float[Array, "p"]:

@@ -15,7 +15,6 @@ resampling made agree with each other, and would let it run ahead.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -38,45 +37,8 @@ from probnerf.sampling.hmc import (
 )
 from probnerf.sampling.populations import gathered, log_prior
 from probnerf.sampling.resampling import choose, next_beta
+from probnerf.settings import TemperedSMCConfig
 from probnerf.types import Posterior
-
-
-@dataclass(frozen=True)
-class TemperedSMCConfig:
-    """Sizes and targets; all are compiled in."""
-
-    populations: int = 2  # independent runs: their spread is the Monte Carlo error
-    particles: int = 64  # per population; populations * particles positions are evaluated at a time
-    start_particles: int = 256  # drawn from the reference per population for the first importance step
-    ess_target: float = 0.5  # effective sample size kept by each step of beta, as a fraction of the pool
-    moves: int = 4  # HMC iterations a stage: a population's pool has moves * particles states
-    leapfrog_steps: int = 4
-    target_acceptance: float = 0.8
-    least_moved: float = 0.3  # accepted moves of a particle, on average, without which beta waits
-    final_stages: int = 2  # at beta = 1
-    keep: int = 2  # the last of them, whose pools become the samples
-    max_stages: int = 200
-    evidence_power: float = 1.0  # a population's share of the weight is its evidence estimate to this power
-    metric: bool = True  # read off the population; without, the prior's
-
-    def __post_init__(self) -> None:
-        if min(self.populations, self.moves, self.leapfrog_steps, self.max_stages) < 1 or self.particles < 2:
-            raise ValueError("TemperedSMCConfig: counts must be positive, and particles at least 2")
-        if self.start_particles < self.particles:
-            raise ValueError(
-                f"TemperedSMCConfig: start_particles {self.start_particles} must be at least particles {self.particles}"
-            )
-        if not (0 < self.ess_target < 1 and 0 < self.target_acceptance < 1 and 0 <= self.evidence_power <= 1):
-            raise ValueError("TemperedSMCConfig: ess_target, target_acceptance and evidence_power: between 0 and 1")
-        if not 1 <= self.keep <= self.final_stages:
-            raise ValueError(
-                f"TemperedSMCConfig: keep {self.keep} must lie between 1 and final_stages {self.final_stages}"
-            )
-
-    @property
-    def longest_step(self) -> float:
-        """A quarter turn a trajectory: under the right metric all periods are 2 pi, and more undoes itself."""
-        return 0.5 * np.pi / self.leapfrog_steps
 
 
 class _State(eqx.Module):

@@ -6,9 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from node.ros.bus import Bus
-from node.ros.bus_config import BusConfig
 from node.ros.messages import frame_messages
-from node.ros.topic_source import TopicConfig
+from node.ros.settings import BusConfig, TopicConfig
 from perception.sources.recording import Log
 
 

@@ -8,9 +8,9 @@ from typing import Any
 import zenoh
 
 from node.ros.bus import Bus
-from node.ros.bus_config import BusConfig
 from node.ros.messages import HYPOTHESES, hypotheses_message, make, register_service, type_hash
 from node.ros.rmw_zenoh import key
+from node.ros.settings import BusConfig
 from tests.node.shapes import body_with_handle
 
 ADD, ADD_TEXT = "example_interfaces/srv/AddTwoInts", "int64 a\nint64 b\n---\nint64 sum\n"

@@ -4,9 +4,9 @@ import pytest
 
 from examples.reach import main
 from node.ros.bus import Bus
-from node.ros.bus_config import BusConfig
 from node.ros.messages import QUERY_REGION
 from node.ros.services import Answers
+from node.ros.settings import BusConfig
 from tests.node.shapes import body_with_handle, free_port
 
 

@@ -12,10 +12,11 @@ from benchmarks.scenes.meshes import Cloud, picture_of
 from benchmarks.scenes.vessels import ViewConfig, simulated_camera
 from perception.answers.query import query
 from perception.answers.regions import Box
-from perception.inference.controller import ControllerConfig, Estimate, estimate
+from perception.inference.controller import Estimate, estimate
+from perception.inference.settings import ControllerConfig
 from perception.observation.object_frame import BODY_EXTENT
-from perception.observation.rays import ObserveConfig
 from perception.observation.segmentation import segment
+from perception.observation.settings import ObserveConfig
 from perception.simulation.sensor_faults import sense
 from perception.simulation.simulated_camera import place_camera
 from perception.sources.frame import Frame

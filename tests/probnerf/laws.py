@@ -15,6 +15,7 @@ import numpy as np
 
 from probnerf.sampling import hmc, tempered_smc
 from probnerf.sampling.gaussian_mixture import GaussianMixture
+from probnerf.settings import AnnealedHMCConfig, TemperedSMCConfig
 
 DIM = 6
 SIGMAS = 4.5
@@ -170,7 +171,7 @@ def smc_finds_the_same_from_any_reference(smc: ModuleType) -> None:
 def a_cut_run_goes_on_from_the_density_that_it_reached(populations: ModuleType) -> None:
     """Cut between its reference and the posterior, and gone on with from the prior's side, evidence stays unbiased."""
     args, mean, covariance, evidence = problem()
-    config = tempered_smc.TemperedSMCConfig(populations=16, particles=48, start_particles=96, evidence_power=0.0)
+    config = TemperedSMCConfig(populations=16, particles=48, start_particles=96, evidence_power=0.0)
     reference = reference_for(mean, covariance)
     cut = tempered_smc.tempered_smc(jax.random.key(0), linear, args, DIM, config, reference=reference, stages=0)
     if not 0.0 < float(cut.diagnostics.beta.max()) < 1.0:
@@ -222,7 +223,7 @@ def resampling_gives_each_its_due(resampling: ModuleType) -> None:
 def annealing_keeps_draws_of_its_last_temperatures(annealed: ModuleType) -> None:
     """The last state of many short chains of the paper's sampler is a draw of the target that it ended at."""
     args, mean, covariance, _ = problem((30.0, 4.0), beta=1.0)
-    config = annealed.AnnealedHMCConfig(
+    config = AnnealedHMCConfig(
         chains=4096, iterations=40, leapfrog_steps=4, s_start=1.0, s_end=0.5, keep=1, tune_iterations=0,
         step_per_scale=0.5,
     )  # fmt: skip

@@ -15,12 +15,12 @@ import pytest
 from probnerf import compile_cache
 from probnerf.compile_cache import Program
 from probnerf.fields.cylinder import CylinderModel
-from probnerf.inference import InferConfig, likelihood_of, likelihood_settings
+from probnerf.inference import likelihood_of, likelihood_settings
 from probnerf.likelihood.dispatch import log_likelihood
 from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.objects.cylinder_scenes import draw_pixels, grid_of_rays
 from probnerf.sampling import tempered_smc
-from probnerf.sampling.tempered_smc import TemperedSMCConfig
+from probnerf.settings import InferConfig, TemperedSMCConfig
 
 ROOT = Path(__file__).parents[2]
 TRACED: list[Any] = []

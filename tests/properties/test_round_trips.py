@@ -17,9 +17,10 @@ from perception.answers.hypotheses import Hypotheses
 from perception.answers.hypotheses_file import load, save
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import read_frame_folder, write_frame_folder
-from perception.sources.recorder import RecordConfig, Recorder
+from perception.sources.recorder import Recorder
 from perception.sources.recording import Log
 from perception.sources.schedule_entry import Scheduled
+from perception.sources.settings import RecordConfig
 from tests.properties.drawn import assert_same, cameras, every_field, frames, hypotheses, law, slower_law, stamps
 
 QUATERNION = 1e-12  # what a rotation loses on its way through a quaternion

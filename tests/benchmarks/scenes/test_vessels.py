@@ -21,15 +21,16 @@ from benchmarks.studies.frame import (
     weighted_median,
 )
 from benchmarks.studies.hidden import judge
-from perception.inference.controller import ControllerConfig, estimate
+from perception.inference.controller import estimate
+from perception.inference.settings import ControllerConfig
 from perception.observation.segmentation import segment
+from perception.observation.settings import PlaneGuess
 from perception.observation.support_plane import heights
 from perception.observation.visibility import answered_voxels
-from perception.observation.without_depth import PlaneGuess
 from perception.sources.frame_folder import read_frame_folder
-from probnerf.inference import InferConfig, quick_smc
 from probnerf.prior.checkpoint import load_prior
 from probnerf.rendering.occupancy import coarsen, voxel_centres
+from probnerf.settings import InferConfig, quick_smc
 from probnerf.types import BASE_Z
 
 

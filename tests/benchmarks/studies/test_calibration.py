@@ -13,7 +13,7 @@ from benchmarks.scenes.conditions import BEHIND, SORTS
 from benchmarks.scenes.vessels import pixels_of_handle
 from benchmarks.studies.calibration import _answered_by_all, _settings, called_free, pooled_ece
 from benchmarks.studies.sbc import CONDITIONS, STATISTICS, Options, identity, main, outside, ranks_of
-from perception.inference.controller import ControllerConfig
+from perception.inference.settings import ControllerConfig
 
 
 def test_a_pooled_error_lets_objects_that_err_apart_cancel() -> None:

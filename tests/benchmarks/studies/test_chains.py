@@ -21,7 +21,7 @@ from benchmarks.studies.chains import (
     relative_spread,
     unexplained,
 )
-from perception.inference.controller import ControllerConfig
+from perception.inference.settings import ControllerConfig
 from probnerf.prior.checkpoint import load_prior
 
 

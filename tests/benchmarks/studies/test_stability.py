@@ -9,7 +9,7 @@ from benchmarks.scenes.conditions import PICTURES_BEGIN, any_view
 from benchmarks.scenes.faults import AXES, Axis, noise_frame, occlusion
 from benchmarks.scenes.vessels import base_rate, vessel_view
 from benchmarks.studies.stability import Options, Seen, look, main
-from perception.inference.controller import ControllerConfig
+from perception.inference.settings import ControllerConfig
 from perception.sources.frame import Frame
 from probnerf.objects.tabletop import TEST_SEEDS
 from probnerf.prior.checkpoint import load_prior

@@ -15,10 +15,10 @@ import pytest
 
 from node.__main__ import main
 from node.commands.config_file import load_config
-from node.commands.live import LiveConfig
+from node.commands.options import LiveConfig
 from node.ros.bus import Bus
-from node.ros.bus_config import BusConfig
 from node.ros.messages import HYPOTHESES, NEXT_VIEW, QUERY_REGION, hypotheses_from, make
+from node.ros.settings import BusConfig
 from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.recording import Log
 from probnerf.prior.checkpoint import save_prior

@@ -16,7 +16,8 @@ import pytest
 
 from node.__main__ import main
 from node.commands.config_file import load_config
-from node.commands.live import LiveConfig, _Keeper
+from node.commands.live import _Keeper
+from node.commands.options import LiveConfig
 from node.viewer.page import Page
 from perception.inference.tracker import Tracker, Update
 from perception.sources.frame import StillSource

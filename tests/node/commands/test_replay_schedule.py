@@ -20,8 +20,9 @@ from node.commands.config_file import load_config
 from node.commands.replay import ReplayConfig
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.hypotheses_file import load
-from perception.inference.controller import ControllerConfig, Estimate, View, estimate
+from perception.inference.controller import Estimate, View, estimate
 from perception.inference.schedule import config_hash, scheduled
+from perception.inference.settings import ControllerConfig
 from perception.observation.segmentation import Segment, segment
 from perception.sources.frame import Frame
 from perception.sources.open_source import SHIPPED_LOG
@@ -220,7 +221,7 @@ def test_record_on_a_full_disk_keeps_what_was_written(tmp_path: Path, capsys: py
             recorder.write_frame(small_frame(i))
     with no_file_beyond(source.stat().st_size // 2), pytest.MonkeyPatch.context() as patch:
         import node.commands.record
-        from perception.sources.recorder import RecordConfig
+        from perception.sources.settings import RecordConfig
 
         patch.setattr(node.commands.record, "RecordConfig", lambda **given: RecordConfig(**given, chunk_bytes=1))
         assert main(["record", str(source), "--out", str(out)]) == 1

@@ -13,8 +13,8 @@ import node.commands.train
 from node.__main__ import main
 from probnerf.geometry import look_at
 from probnerf.prior.checkpoint import load_prior
-from probnerf.training.elbo import TrainConfig
 from probnerf.training.pictures import ViewSet
+from probnerf.training.settings import TrainConfig
 from probnerf.training.srn_dataset import NO_RANGE, Instance, write_instance
 from probnerf.training.surface_samples import Solids
 

@@ -16,8 +16,9 @@ from node.commands.replay import ReplayConfig
 from perception.answers.hypotheses_file import load, save
 from perception.answers.query import query
 from perception.answers.regions import Box
-from perception.inference.controller import ControllerConfig, Estimate, View
+from perception.inference.controller import Estimate, View
 from perception.inference.schedule import config_hash, digest, scheduled
+from perception.inference.settings import ControllerConfig
 from perception.inference.tracker import Tracker
 from perception.observation.segmentation import segment
 from perception.sources.recorder import Recorder

@@ -14,9 +14,9 @@ import zenoh
 
 from node.commands.config_file import load_config
 from node.ros.bus import Bus
-from node.ros.bus_config import BusConfig
 from node.ros.messages import encode, make, register_service, type_hash
 from node.ros.rmw_zenoh import Node, attachment, gid, key, read_attachment
+from node.ros.settings import BusConfig
 from tests.node.peer import SET, SET_TEXT
 from tests.node.shapes import free_port
 

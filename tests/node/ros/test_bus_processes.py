@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from node.ros.bus import Bus
-from node.ros.bus_config import BusConfig
 from node.ros.messages import HYPOTHESES, encode, header, hypotheses_from, hypotheses_message, make, register_service
+from node.ros.settings import BusConfig
 from tests.conftest import ROOT
 from tests.node.peer import ADD, ADD_TEXT, IMAGE, SET, SET_TEXT
 from tests.node.shapes import body_with_handle, free_port

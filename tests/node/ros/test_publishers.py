@@ -7,11 +7,11 @@ import numpy as np
 
 from calibration.camera import Camera
 from node.ros.bus import Bus
-from node.ros.bus_config import BusConfig
 from node.ros.messages import HYPOTHESES, hypotheses_from
 from node.ros.publishers import Announcer
 from node.ros.scene_messages import Status
-from node.ros.topic_source import TopicConfig, TopicSource
+from node.ros.settings import BusConfig, TopicConfig
+from node.ros.topic_source import TopicSource
 from perception.sources.frame import Frame
 from tests.node.shapes import body_with_handle
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from node.ros.bus import Bus
-from node.ros.bus_config import BusConfig
 from node.ros.messages import NEXT_VIEW, QUERY_REGION, header, make, matrix, pose
 from node.ros.parameters import flat, serve_parameters
 from node.ros.services import BOX, POINTS, SWEPT, Answers
+from node.ros.settings import BusConfig
 from perception.answers.query import query
 from perception.answers.regions import Box, Points
 from probnerf.geometry import look_at

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from node.ros.bus import Bus
-from node.ros.bus_config import BusConfig
 from node.ros.messages import header, make
-from node.ros.topic_source import TopicConfig, TopicSource
+from node.ros.settings import BusConfig, TopicConfig
+from node.ros.topic_source import TopicSource
 
 WIDTH, HEIGHT, MS = 32, 24, 1_000_000
 COLOUR, DEPTH, INFO = "/cam/color/image_raw", "/cam/depth/image_raw", "/cam/color/camera_info"

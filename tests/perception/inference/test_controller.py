@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from perception.answers.hypotheses import Hypotheses
-from perception.inference.controller import ControllerConfig, Estimate, estimate
+from perception.inference.controller import Estimate, estimate
+from perception.inference.settings import ControllerConfig
 from perception.inference.warm_up import _alone
 from perception.observation.segmentation import Segment, segment
 from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.recording import Log
-from probnerf.inference import InferConfig, quick_smc
 from probnerf.prior.checkpoint import load_prior
+from probnerf.settings import InferConfig, quick_smc
 from tests.perception.inference.test_tracker import frame_from
 
 CONFIG = ControllerConfig(

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perception.inference.controller import ControllerConfig
 from perception.inference.schedule import config_hash, digest, scheduled
-from perception.observation.segmentation import SegmentConfig
+from perception.inference.settings import ControllerConfig
+from perception.observation.settings import SegmentConfig
 from perception.sources.recorder import Recorder
 from perception.sources.recording import Log
 from perception.sources.schedule_entry import SCHEDULE_TOPIC, Scheduled

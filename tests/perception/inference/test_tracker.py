@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from perception.answers.hypotheses import Hypotheses
-from perception.inference.controller import ControllerConfig
-from perception.inference.tracker import TrackConfig, Tracker, _Kept, _same_plane, _with_view
+from perception.inference.settings import ControllerConfig, TrackConfig
+from perception.inference.tracker import Tracker, _Kept, _same_plane, _with_view
 from perception.observation.rays import observe
 from perception.observation.segmentation import segment
 from perception.simulation.sensor_faults import simulate

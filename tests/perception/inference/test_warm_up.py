@@ -13,20 +13,20 @@ import pytest
 from benchmarks.scenes.cartons import carton_seeds, half_hidden
 from benchmarks.scenes.conditions import any_view
 from benchmarks.scenes.vessels import vessel_view
-from perception.inference.controller import ControllerConfig
+from perception.inference.settings import ControllerConfig
 from perception.inference.tracker import Tracker, Update
 from perception.inference.warm_up import _alone, warm_up
 from perception.observation.segmentation import segment
 from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.recording import Log
 from probnerf import compile_cache, inference, shapes
-from probnerf.inference import InferConfig, quick_smc
 from probnerf.kernel import library
 from probnerf.likelihood import pixel_terms
 from probnerf.prior import posterior_network
 from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.sampling import modes, tempered_smc
+from probnerf.settings import InferConfig, quick_smc
 from probnerf.types import UNKNOWN
 from tests.node.shapes import body_with_handle
 

@@ -9,21 +9,23 @@ import pytest
 
 from calibration.camera import Camera
 from perception.answers.hypotheses import Hypotheses
-from perception.inference.controller import ControllerConfig, Estimate, estimate
-from perception.observation.rays import ObserveConfig, observe
+from perception.inference.controller import Estimate, estimate
+from perception.inference.settings import ControllerConfig
+from perception.observation.rays import observe
 from perception.observation.segmentation import segment
+from perception.observation.settings import ObserveConfig
 from perception.observation.visibility import seen_voxels
 from perception.simulation.sensor_faults import simulate
 from perception.simulation.simulated_camera import Placed, Scene, place_camera
 from perception.sources.frame import Frame
 from probnerf.fields.cylinder import CylinderModel
-from probnerf.inference import InferConfig, quick_smc
 from probnerf.likelihood.position import pose_of
 from probnerf.objects.tabletop import VALIDATION_SEEDS, signed_distance
 from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering.occupancy import voxel_centres
 from probnerf.sampling.hmc import StageInfo
+from probnerf.settings import InferConfig, quick_smc
 from probnerf.shapes import scaled_about
 from probnerf.types import BASE_Z, FREE, OBJECT, UNKNOWN
 from tests.perception.cylinders import CAN, Cylinder, looking_down, picture

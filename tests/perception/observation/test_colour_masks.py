@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from perception.observation.colour_masks import MaskConfig, changed, label_colour
-from perception.observation.segmentation import Segment, SegmentConfig, segment
-from perception.observation.without_depth import PlaneGuess
+from perception.observation.colour_masks import changed, label_colour
+from perception.observation.segmentation import Segment, segment
+from perception.observation.settings import MaskConfig, PlaneGuess, SegmentConfig
 from perception.sources.frame import Frame
 from probnerf.types import FREE, OBJECT, UNKNOWN
 from tests.perception.cylinders import CAN, Cylinder, looking_down, picture

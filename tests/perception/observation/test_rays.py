@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perception.inference.controller import ControllerConfig, estimate
+from perception.inference.controller import estimate
+from perception.inference.settings import ControllerConfig
 from perception.observation.object_frame import BODY_EXTENT, ObjectFrame, object_frame
-from perception.observation.rays import ObserveConfig, calibration_widths, observe
+from perception.observation.rays import calibration_widths, observe
 from perception.observation.segmentation import Segment, segment
+from perception.observation.settings import ObserveConfig
 from perception.observation.visibility import inside_view, seen_voxels
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import read_frame_folder

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from perception.observation.segmentation import Segment, SegmentConfig, backproject, segment
+from perception.observation.segmentation import Segment, backproject, segment
+from perception.observation.settings import SegmentConfig
 from perception.observation.support_plane import heights
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import read_frame_folder

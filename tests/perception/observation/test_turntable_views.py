@@ -5,7 +5,7 @@ import pytest
 
 from calibration.camera import Camera
 from perception.observation.turntable_views import (
-    MaskConfig,
+    PlateMaskConfig,
     bounds_by_carving,
     bounds_by_depth,
     cube_of,
@@ -94,16 +94,16 @@ def test_masks_are_the_object(how: str) -> None:
         frame, T = scene.frame(angle), scene.T_plate_camera(angle)
         view = square(frame)
         if how == "depth":
-            mask = mask_by_depth(view, T, BOARD, MaskConfig())
+            mask = mask_by_depth(view, T, BOARD, PlateMaskConfig())
         else:
-            mask = mask_by_picture(view, T, BOARD, empty, MaskConfig())
+            mask = mask_by_picture(view, T, BOARD, empty, PlateMaskConfig())
         assert overlap(mask, truth(frame)) > 0.92
     bare_view = square(Turning(depth=how == "depth", ground=scene.ground, block=False).frame(0.0))
     T = scene.T_plate_camera(0.0)
     found = (
-        mask_by_depth(bare_view, T, BOARD, MaskConfig())
+        mask_by_depth(bare_view, T, BOARD, PlateMaskConfig())
         if how == "depth"
-        else mask_by_picture(bare_view, T, BOARD, empty, MaskConfig())
+        else mask_by_picture(bare_view, T, BOARD, empty, PlateMaskConfig())
     )
     assert found.mean() < 5e-4  # an empty plate holds no object
 

@@ -8,9 +8,9 @@ import pytest
 
 from calibration.camera import Camera
 from perception.observation.object_frame import object_frame
-from perception.observation.rays import ObserveConfig
-from perception.observation.segmentation import SegmentConfig, segment
-from perception.observation.without_depth import PlaneGuess, StandingBody, plane_depth, standing_body, supposed_plane
+from perception.observation.segmentation import segment
+from perception.observation.settings import ObserveConfig, PlaneGuess, SegmentConfig
+from perception.observation.without_depth import StandingBody, plane_depth, standing_body, supposed_plane
 from perception.simulation.simulated_camera import Placed, Scene, place_camera, render
 from perception.sources.frame import Frame
 from probnerf.objects.tabletop import VALIDATION_SEEDS

@@ -22,9 +22,10 @@ from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
 from perception.sources.frame import Frame
-from perception.sources.recorder import RecordConfig, Recorder, write_log
+from perception.sources.recorder import Recorder, write_log
 from perception.sources.recording import Log
 from perception.sources.ros_images import MM
+from perception.sources.settings import RecordConfig
 
 ROOT = Path(__file__).parents[3]
 K = np.array([[90.0, 0.0, 31.0], [0.0, 91.0, 23.0], [0.0, 0.0, 1.0]])

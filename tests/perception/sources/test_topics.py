@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from perception.sources.recording import Log
-from perception.sources.topics import TopicNames, is_rectified, name_parts
+from perception.sources.topic_names import is_rectified, name_parts
+from perception.sources.topics import TopicNames
 from tests.perception.sources.test_recording import MM, RGB, START, maker, record, says
 
 make = maker("mcap")

@@ -30,8 +30,9 @@ from probnerf.objects.cylinder_scenes import (
     yaw_histogram,
 )
 from probnerf.rendering.foam import Lattice
-from probnerf.sampling.annealed_hmc import AnnealedHMCConfig, annealed_hmc
+from probnerf.sampling.annealed_hmc import annealed_hmc
 from probnerf.sampling.tempered_smc import tempered_smc
+from probnerf.settings import AnnealedHMCConfig
 from probnerf.types import OBJECT, Posterior
 
 CONDITIONS = [(condition, depth) for condition in YAW_OF for depth in (False, True)]

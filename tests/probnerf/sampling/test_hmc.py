@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from probnerf.sampling.annealed_hmc import AnnealedHMCConfig, annealed_hmc
+from probnerf.sampling.annealed_hmc import annealed_hmc
 from probnerf.sampling.hmc import (
     HMCState,
     Metric,
@@ -21,6 +21,7 @@ from probnerf.sampling.hmc import (
     leapfrog,
     split_r_hat,
 )
+from probnerf.settings import AnnealedHMCConfig
 
 
 def silent(args, q):

@@ -8,8 +8,9 @@ import pytest
 from blackjax.smc import extend_params, resampling
 from jaxtyping import Array, Float
 
-from probnerf.sampling.annealed_hmc import AnnealedHMCConfig, annealed_hmc
-from probnerf.sampling.tempered_smc import TemperedSMCConfig, tempered_smc
+from probnerf.sampling.annealed_hmc import annealed_hmc
+from probnerf.sampling.tempered_smc import tempered_smc
+from probnerf.settings import AnnealedHMCConfig, TemperedSMCConfig
 
 SIGMAS = 4.0
 Y = jnp.float32(2.0)

@@ -10,9 +10,10 @@ from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.likelihood.position import pose_of, split_position
 from probnerf.likelihood.settings import Likelihood
 from probnerf.rendering import foam
-from probnerf.sampling.ascent import AdamConfig, ascend
+from probnerf.sampling.ascent import ascend
 from probnerf.sampling.map_estimate import MAPConfig, map_estimate
 from probnerf.sampling.modes import log_posterior
+from probnerf.settings import AdamConfig
 from probnerf.types import FREE, OBJECT, Observation, Rays
 
 MODEL = CylinderModel()

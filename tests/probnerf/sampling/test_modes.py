@@ -9,17 +9,17 @@ import pytest
 
 from probnerf.fields.cylinder import CylinderModel
 from probnerf.geometry import look_at
-from probnerf.inference import InferConfig, encoder_guess, infer, likelihood_of, modes_of
+from probnerf.inference import encoder_guess, infer, likelihood_of, modes_of
 from probnerf.likelihood.dispatch import log_likelihood
 from probnerf.likelihood.pixel_terms import log_likelihood_one
 from probnerf.objects.cylinder_scenes import integrate, scene, total_variation, yaw_histogram
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.prior.posterior_network import Picture, guesses, potential_at
 from probnerf.sampling import modes
-from probnerf.sampling.ascent import AdamConfig
 from probnerf.sampling.gaussian_mixture import GaussianMixture
-from probnerf.sampling.modes import ModesConfig, log_posterior, mixture_of_modes
-from probnerf.sampling.tempered_smc import TemperedSMCConfig, tempered_smc
+from probnerf.sampling.modes import log_posterior, mixture_of_modes
+from probnerf.sampling.tempered_smc import tempered_smc
+from probnerf.settings import AdamConfig, InferConfig, ModesConfig, TemperedSMCConfig
 from probnerf.types import Pose
 
 NARROW = 1e6  # precision of the narrow mode in each of six dimensions

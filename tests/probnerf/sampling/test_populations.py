@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from probnerf.inference import InferConfig, quick_smc, sampler_of
+from probnerf.inference import sampler_of
 from probnerf.sampling.populations import FAILED, log_prior, pooled, shares, start_from, thin
-from probnerf.sampling.tempered_smc import TemperedSMCConfig, tempered_smc
+from probnerf.sampling.tempered_smc import tempered_smc
+from probnerf.settings import InferConfig, TemperedSMCConfig, quick_smc
 from probnerf.types import Posterior
 
 CONFIG = TemperedSMCConfig(populations=2, particles=64)

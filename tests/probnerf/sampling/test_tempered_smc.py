@@ -13,7 +13,8 @@ from probnerf.sampling.hmc import StageInfo
 from probnerf.sampling.populations import log_prior
 from probnerf.sampling.resampling import ess as effective_size
 from probnerf.sampling.resampling import next_beta
-from probnerf.sampling.tempered_smc import TemperedSMCConfig, tempered_smc
+from probnerf.sampling.tempered_smc import tempered_smc
+from probnerf.settings import TemperedSMCConfig
 from probnerf.types import Posterior
 
 CONFIG = TemperedSMCConfig(populations=4, particles=32, start_particles=128)

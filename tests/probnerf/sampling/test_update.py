@@ -10,9 +10,10 @@ import pytest
 from probnerf.likelihood.dispatch import log_likelihood
 from probnerf.likelihood.pixel_terms import faces_of_view, log_likelihood_one
 from probnerf.objects.cylinder_scenes import Args, integrate, scene, total_variation, yaw_histogram
-from probnerf.sampling.modes import ModesConfig, mixture_of_modes
+from probnerf.sampling.modes import mixture_of_modes
 from probnerf.sampling.populations import start_from
-from probnerf.sampling.tempered_smc import TemperedSMCConfig, tempered_smc
+from probnerf.sampling.tempered_smc import tempered_smc
+from probnerf.settings import ModesConfig, TemperedSMCConfig
 from probnerf.types import Posterior, joined
 
 CONFIG = TemperedSMCConfig(populations=4, particles=64)

@@ -18,8 +18,9 @@ from probnerf.prior.checkpoint import load_prior, save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering import foam
 from probnerf.training.batches import draw_batch, strata_of
-from probnerf.training.elbo import TrainConfig, TrainState, initial_state, loss, train
+from probnerf.training.elbo import TrainState, initial_state, loss, train
 from probnerf.training.pictures import ViewSet, draw_views
+from probnerf.training.settings import TrainConfig
 from probnerf.training.surface_samples import Solids, colour_samples, draw_solids, shape_samples
 
 CONFIG = TrainConfig(

@@ -16,7 +16,8 @@ from probnerf.prior.encoder_input import ENCODER_RADIUS
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering import foam
 from probnerf.training.batches import draw_batch, strata_of
-from probnerf.training.elbo import TrainConfig, train
+from probnerf.training.elbo import train
+from probnerf.training.settings import TrainConfig
 from probnerf.training.srn_dataset import NO_RANGE, Instance, find_instances, read_instance, read_views, write_instance
 
 SIZE = 16  # of the tiny preset

@@ -1,9 +1,11 @@
-"""What the bus listens to and whom it admits, and the same as Zenoh's settings."""
+"""Settings of the bus (what it listens to, whom it admits; the same as Zenoh's settings) and of a camera's topics."""
 
 import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+
+from perception.sources.topic_names import named_otherwise
 
 _NODE = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _SPACE = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
@@ -93,3 +95,25 @@ class BusConfig:
                 "policies": [{"rules": ["ros"], "subjects": ["allowed"]}],
             }
         return settings
+
+
+@dataclass(frozen=True)
+class TopicConfig:
+    """Where a camera driver publishes. A colour topic whose name ends in /compressed carries CompressedImage."""
+
+    colour: str = "/camera/color/image_raw"
+    depth: str | None = "/camera/aligned_depth_to_color/image_raw"  # aligned to colour; None: frames without depth
+    info: str = "/camera/color/camera_info"
+    rectified: bool | None = None  # the images are: the camera is that of the info's P, without distortion; None: as
+    # the colour topic's name says, by a part rect or rectified
+    aligned: bool = False  # depth is aligned to colour though its frame_id is another
+    tolerance_ms: float = 10.0  # between the stamps of colour and depth
+    silence_s: float = 2.0  # without a frame, after which a note says so
+    end_s: float | None = None  # without a frame, after which the source ends; None: never
+    waiting: int = 10  # colour images that wait for their depth, at most
+
+    def __post_init__(self) -> None:
+        if not (self.tolerance_ms >= 0 and self.silence_s > 0 and self.waiting >= 1):
+            raise ValueError("tolerance_ms must not be negative, silence_s be positive, and waiting be 1 or more")
+        if self.depth is not None and (word := named_otherwise(self.depth)):
+            raise ValueError(f"topic: depth is {self.depth}, whose name says {word}; give the camera's depth image")

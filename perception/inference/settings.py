@@ -1,0 +1,70 @@
+"""Settings of inference on frames, publishing and tracking. Standard library only, for the command line reads them
+without JAX."""
+
+import math
+from dataclasses import dataclass, field
+
+from perception.observation.settings import ObserveConfig
+from probnerf.settings import InferConfig
+
+
+@dataclass(frozen=True)
+class PublishConfig:
+    """How finely an answer is given."""
+
+    hypotheses: int = 48  # shapes published
+    grid: int = 64  # voxels per axis, G
+    out_of_model_below: float = 0.90  # share of telling pixels explained on average; validation objects: 0.91 and more
+
+    def __post_init__(self) -> None:
+        if self.hypotheses < 1:
+            raise ValueError(f"hypotheses is {self.hypotheses}; give 1 or more")
+        if not 1 <= self.grid <= 512:
+            raise ValueError(f"grid is {self.grid}; give 1 to 512")
+
+
+@dataclass(frozen=True)
+class ControllerConfig(PublishConfig):
+    """What is inferred at most, when less is enough, and how finely it is published."""
+
+    infer: InferConfig = field(default_factory=InferConfig)  # of one run
+    observe: ObserveConfig = field(default_factory=ObserveConfig)
+    first_hypotheses: int = 8  # published while better ones are under way
+    unexplained: float = 0.1  # share of pixels above which all runs are made
+    tolerance: float = 0.005  # nats a voxel of unseen space that having no more populations may lose
+    runs: int = 4  # at most
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if min(self.first_hypotheses, self.runs) < 1:
+            raise ValueError(f"first_hypotheses {self.first_hypotheses} and runs {self.runs} must be 1 or more")
+        if not (self.tolerance >= 0.0 and 0.0 <= self.unexplained <= 1.0):
+            raise ValueError(f"tolerance {self.tolerance:g} must be 0 or more, unexplained {self.unexplained:g} 0 to 1")
+
+    def needed(self, done: int, loss: float, missed: float) -> int:
+        """How many runs the answer takes, if `done` of them leave this expected loss and share of pixels missed."""
+        if missed > self.unexplained:
+            return self.runs
+        if loss <= self.tolerance or math.isinf(self.tolerance):  # whatever it loses, known or not
+            return done
+        wanted = done * loss / self.tolerance if self.tolerance > 0 and math.isfinite(loss) else math.inf
+        return min(self.runs, max(done + 1, math.ceil(min(wanted, self.runs))))
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """When a frame counts as a further view of an object, and when as another place of it."""
+
+    views: int = 3  # kept of each object; a further one takes the place of the nearest
+    apart: float = 15.0  # degrees between the directions of two views; one from nearer by takes the other's place
+    adds: float = 0.08  # share of the unseen space above the plane that a frame must see first; noise sees 0.01 to 0.03
+    checked: int = 32  # hypotheses that a frame is held against: the best of them counts
+    moved_below: float = 0.8  # share of telling pixels explained by the best of them under which the object has moved
+    reach: float = 0.6  # half extents; without a label map the object nearer than this is the same one
+    plane_degrees: float = 2.0  # without T_world_camera the camera stands still while its plane does, to so much
+    plane_m: float = 0.01
+    objects: int = 16  # remembered; of more, those inferred longest ago are forgotten
+
+    def __post_init__(self) -> None:
+        if min(self.views, self.checked) < 1:
+            raise ValueError(f"views {self.views} and checked {self.checked} must be 1 or more")
