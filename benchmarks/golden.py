@@ -30,7 +30,6 @@ from perception.simulation.simulated_camera import Placed, Scene, place_camera, 
 from perception.sources.frame import Frame
 from perception.sources.open_source import open_source
 from probnerf.prior.checkpoint import Prior, load_prior
-from probnerf.types import BASE_Z
 
 FIRST_VALIDATION_SEED = 1_003_500  # objects of the family that no prior was trained on and no figure is scored on
 
@@ -119,8 +118,7 @@ def differences(old: Path, new: Path) -> list[str]:
 
 def shift(old: Hypotheses, new: Hypotheses) -> tuple[float, float]:
     """|difference| of the mean p_occupied in unseen space above the plane, and the standard error of that."""
-    z = -1.0 + (np.arange(old.grid) + 0.5) * 2.0 / old.grid
-    hidden = ~old.seen & ~new.seen & (z > BASE_Z)
+    hidden = old.unseen & new.unseen
     moved = abs(float(old.p_occupied[hidden].mean() - new.p_occupied[hidden].mean()))
     return moved, float(np.hypot(old.monte_carlo_error, new.monte_carlo_error))
 

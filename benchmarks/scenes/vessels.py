@@ -29,8 +29,8 @@ from probnerf.objects.tabletop import (
     sample_objects,
     to_canonical,
 )
-from probnerf.rendering.occupancy import coarsen, solid, voxel_centres
-from probnerf.types import BASE_Z, Pose
+from probnerf.rendering.occupancy import above_plane, coarsen, solid
+from probnerf.types import Pose
 
 GRID = 32  # voxels per axis that answers are judged on
 FINE = 64  # voxels per axis of the truth, before it is coarsened as the hypotheses are
@@ -159,7 +159,7 @@ def vessel_view(
 
 def in_table(grid: int) -> Bool[np.ndarray, "g"]:
     """Which layers of voxels lie under the plane, by i_z: there is nothing to be seen, and truths end above."""
-    return np.asarray(voxel_centres(grid)[0, 0, :, 2] < BASE_Z)
+    return ~above_plane(grid)
 
 
 def told_pose(T_world_camera: Float[np.ndarray, "4 4"], seed: int) -> Float[np.ndarray, "4 4"]:

@@ -36,7 +36,7 @@ from perception.answers.query import CAUTION
 from perception.answers.regions import Swept
 from perception.inference.controller import estimate
 from probnerf.prior.checkpoint import load_prior
-from probnerf.rendering.occupancy import coarsen, voxel_centres
+from probnerf.rendering.occupancy import above_plane, coarsen, voxel_centres
 from probnerf.types import BASE_Z
 
 FARSIDE, INDEPENDENT, FREE, OCCUPIED = BELIEFS = (
@@ -92,11 +92,10 @@ def belief_of(view: VesselView, h: Hypotheses) -> Belief:
     measured = np.zeros((GRID,) * 3, bool)
     measured[tuple(index.T)] = True
     seen = h.seen.reshape(GRID, 2, GRID, 2, GRID, 2).all(axis=(1, 3, 5))  # the whole of a coarse voxel
-    above = voxel_centres(GRID)[..., 2] >= BASE_Z
     return Belief(
         truth=view.solid,
         measured=measured,
-        unseen=~seen & above & ~measured,
+        unseen=~seen & above_plane(GRID) & ~measured,
         shapes=coarsen(h.solid, GRID),
         weights=h.weights,
         caution=CAUTION if h.out_of_model else 0.0,

@@ -4,8 +4,6 @@ import numpy as np
 from jaxtyping import Float
 
 from perception.answers.hypotheses import Hypotheses
-from probnerf.rendering.occupancy import voxel_centres
-from probnerf.types import BASE_Z
 
 CM3 = 1e6  # per cubic metre
 R_HAT = 1.1  # above it chains have not mixed (Gelman et al., BDA3, section 11.4)
@@ -15,7 +13,7 @@ def hidden_volume(h: Hypotheses) -> tuple[float, Float[np.ndarray, "3"]]:
     """Space in the cube above the plane that the camera did not see (m^3), and how much of it is solid (m^3): the 5, 50
     and 95% weighted quantiles over hypotheses.
     """
-    hidden = ~h.seen & (voxel_centres(h.grid)[..., 2] > BASE_Z)
+    hidden = h.unseen
     solid = h.solid[:, hidden].sum(axis=1) * h.voxel_m**3
     order = np.argsort(solid)
     at = np.searchsorted(np.cumsum(h.weights[order]), [0.05, 0.5, 0.95])

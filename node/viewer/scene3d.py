@@ -19,7 +19,6 @@ from perception.observation.segmentation import Segment, backproject, segment
 from perception.observation.settings import ObserveConfig
 from perception.sources.frame import Frame
 from probnerf.rendering.occupancy import voxel_centres
-from probnerf.types import BASE_Z
 
 AROUND = 2.2  # half extents of its cube: so much of the scene is shown around each object
 MAX_POINTS = 60_000  # of the seen surface
@@ -184,8 +183,7 @@ def cloud(placed: Placed) -> Cloud:
     """The unseen space of all objects."""
     points = []
     for h in placed.objects:
-        cube = voxel_centres(h.grid).astype(np.float64)
-        hidden = cube[~h.seen & (cube[..., 2] >= BASE_Z)]
+        hidden = voxel_centres(h.grid)[h.unseen].astype(np.float64)
         points.append(transform(placed.T_page_object(h), hidden * h.object_frame.half_extent))
     where = np.concatenate(points)
     p = np.asarray(query(placed.objects, Points(where), placed.frame).p_occupied) if len(where) else np.zeros(0)

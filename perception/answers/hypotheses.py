@@ -17,7 +17,7 @@ from skimage.measure import marching_cubes
 
 from perception.observation.object_frame import ObjectFrame
 from probnerf.geometry import rigid
-from probnerf.rendering.occupancy import solid, voxel_centres, voxel_index, voxel_surface
+from probnerf.rendering.occupancy import above_plane, solid, voxel_centres, voxel_index, voxel_surface
 from probnerf.types import BASE_Z
 
 FrameName = Literal["object", "camera", "world"]
@@ -90,6 +90,11 @@ class Hypotheses:
     def base(self) -> Float[np.ndarray, "S"]:
         """Height in the cube on which each hypothesis stands: the plane's, and the error that it supposes of it."""
         return BASE_Z + self.pose[:, 4]
+
+    @property
+    def unseen(self) -> Bool[np.ndarray, "G G G"]:
+        """Space above the support plane that no camera has seen."""
+        return ~self.seen & above_plane(self.grid)
 
     @cached_property
     def p_occupied(self) -> Float[np.ndarray, "G G G"]:

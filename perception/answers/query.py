@@ -15,7 +15,6 @@ from jaxtyping import Float, Int
 
 from perception.answers.hypotheses import FrameName, Hypotheses, binary_entropy
 from perception.answers.regions import Cells, Points, Region, Swept
-from probnerf.rendering.occupancy import voxel_centres
 from probnerf.types import BASE_Z
 
 Verdict = Literal["free", "occupied", "unsure"]
@@ -92,7 +91,7 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
         free, se = h.estimate(~blocked)
         weights, filled = h.weights, np.array([volume[row].sum() for row in occupied])
         if h.out_of_model:
-            hidden = _hidden(h)[index]
+            hidden = h.unseen.ravel()[index]
             free, se = (1 - CAUTION) * free + CAUTION * (not hidden.any()), (1 - CAUTION) * se
             weights, filled = np.append((1 - CAUTION) * weights, CAUTION), np.append(filled, volume[hidden].sum())
         touched.append(h)
@@ -133,16 +132,10 @@ def check_one_frame(scene: Sequence[Hypotheses]) -> None:
             )
 
 
-def _hidden(h: Hypotheses) -> np.ndarray:
-    """bool[G^3]: voxels above the support plane that no pixel has seen."""
-    above = voxel_centres(h.grid)[..., 2] >= BASE_Z
-    return (~h.seen & above).ravel()
-
-
 def marginal(h: Hypotheses) -> Float[np.ndarray, "V"]:
     """p_occupied of each of the G^3 voxels, cautious where the object is out of model."""
     p = h.p_occupied.ravel()
-    return (1 - CAUTION) * p + CAUTION * _hidden(h) if h.out_of_model else p
+    return (1 - CAUTION) * p + CAUTION * h.unseen.ravel() if h.out_of_model else p
 
 
 def _region_voxels(

@@ -18,7 +18,7 @@ from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.checkpoint import Prior
 from probnerf.sampling.populations import thin
 from probnerf.shapes import explained, opacity_grids, poses, scaled_about
-from probnerf.types import BASE_Z, Observation, Posterior
+from probnerf.types import Observation, Posterior
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +96,7 @@ def published(
 
 def _with_error(h: Hypotheses) -> Hypotheses:
     """Fill in the standard error of the mean occupancy of unseen voxels above the plane, and `expected_loss` there."""
-    z = -1.0 + (np.arange(h.grid) + 0.5) * 2.0 / h.grid
-    hidden = ~h.seen & (z > BASE_Z)
+    hidden = h.unseen
     # one shape at a time: to index them all at once would stop every other thread for a fifth of a second
     count = np.array([np.count_nonzero(shape & hidden) for shape in h.solid])
     return replace(

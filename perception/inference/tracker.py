@@ -26,11 +26,11 @@ from perception.observation.visibility import seen_voxels
 from perception.sources.frame import Frame
 from probnerf.inference import likelihood_of, without_sizes
 from probnerf.prior.checkpoint import Prior
-from probnerf.rendering.occupancy import voxel_centres
+from probnerf.rendering.occupancy import above_plane
 from probnerf.sampling.hmc import StageInfo
 from probnerf.sampling.populations import thin
 from probnerf.shapes import explained
-from probnerf.types import BASE_Z, Observation, Posterior, joined, on_device
+from probnerf.types import Observation, Posterior, joined, on_device
 
 Change = Literal["new", "view", "continued", "same", "moved"]
 
@@ -197,7 +197,7 @@ class Tracker:
     def _go_on(self, name: int, track: _Track, view: View, agreement: float, seed: int) -> Look:
         """The look at an object that stands where it stood."""
         seen = seen_voxels(view.frame, view.segment, view.object_frame, self.config.grid)
-        hidden = (voxel_centres(self.config.grid)[..., 2] >= BASE_Z) & ~track.seen
+        hidden = above_plane(self.config.grid) & ~track.seen
         adds = float((hidden & seen).sum()) / max(int(hidden.sum()), 1) >= self.track.adds
         kept = track.kept
         change: Change = "same" if track.posterior.result == "converged" else "continued"

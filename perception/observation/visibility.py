@@ -9,7 +9,7 @@ from perception.observation.object_frame import ObjectFrame
 from perception.observation.segmentation import Segment
 from perception.observation.without_depth import plane_depth
 from perception.sources.frame import Frame
-from probnerf.types import BASE_Z
+from probnerf.rendering.occupancy import above_plane
 
 
 def seen_voxels(
@@ -32,8 +32,7 @@ def answered_voxels(
     from any that are not. That space is free whatever a shape says.
     """
     rest = ~(_behind_the_end(frame, segment, cube, grid) <= -4.0 / grid * cube.half_extent)
-    z = -1.0 + (np.arange(grid) + 0.5) * 2.0 / grid
-    return rest | ndimage.binary_dilation(rest & (z > BASE_Z), iterations=2)
+    return rest | ndimage.binary_dilation(rest & above_plane(grid), iterations=2)
 
 
 def _behind_the_end(

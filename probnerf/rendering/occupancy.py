@@ -22,6 +22,14 @@ def voxel_centres(grid: int) -> Float[np.ndarray, "G G G 3"]:
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
 
 
+def above_plane(grid: int) -> Bool[np.ndarray, "G"]:
+    """Which levels of voxels (last axis of a grid) stand above the support plane: those whose centre is not below it.
+
+    A level whose centre lies in the plane counts, as it does in `solid`. No grid of a multiple of eight has such a one.
+    """
+    return _centre_z(grid) >= BASE_Z
+
+
 def voxel_index(points: Float[ArrayLike, "... 3"], grid: int) -> Int[np.ndarray, "..."]:
     """Flat index (C order) of the voxel that holds each point (cube units); -1 for a point outside the cube."""
     points = np.asarray(points)

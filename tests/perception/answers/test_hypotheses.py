@@ -327,3 +327,10 @@ def test_surface_points_lie_on_the_box():
     surface = surface_points(h, 0) / HALF_EXTENT
     assert len(surface) == 6 * 8 * 8
     np.testing.assert_allclose(np.max(np.abs(surface - [0, 0, BASE_Z + 0.5]), axis=1), 0.5)
+
+
+def test_unseen_space_lies_above_the_plane_and_in_no_view(mixed):
+    seen = np.random.default_rng(0).random(mixed.seen.shape) < 0.5
+    z = voxel_centres(GRID)[..., 2]
+    np.testing.assert_array_equal(replace(mixed, seen=seen).unseen, ~seen & (z > BASE_Z))
+    assert not replace(mixed, seen=np.ones_like(seen)).unseen.any()

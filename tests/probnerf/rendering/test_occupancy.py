@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from probnerf.rendering.occupancy import coarsen, solid, voxel_centres, voxel_index, voxel_surface, wall_opacity
+from probnerf.rendering.occupancy import (
+    above_plane,
+    coarsen,
+    solid,
+    voxel_centres,
+    voxel_index,
+    voxel_surface,
+    wall_opacity,
+)
 from probnerf.types import BASE_Z
 
 GRID = 32
@@ -118,3 +126,13 @@ def test_a_coarse_voxel_is_occupied_where_any_fine_one_is():
     assert coarse.shape == (2, 4, 4, 4) and coarse.mean() > fine.mean()
     with pytest.raises(ValueError, match="divide"):
         coarsen(fine, 3)
+
+
+@pytest.mark.parametrize("grid", [4, 8, 12, 16, 20, 32, 64, 128])
+def test_above_the_plane_is_where_a_shape_that_fills_the_cube_is_solid(grid):
+    full = solid(np.ones((grid, grid, grid), np.float32))
+    np.testing.assert_array_equal(full, np.broadcast_to(above_plane(grid), full.shape))
+    z = voxel_centres(grid)[0, 0, :, 2]
+    np.testing.assert_array_equal(above_plane(grid), z >= BASE_Z)
+    # Only where grid / 4 is odd does a level of centres lie in the plane; it counts as above.
+    assert (z == BASE_Z).any() == (grid % 8 == 4)
