@@ -22,7 +22,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "perception": {"calibration", "probnerf"},
     "node": {"calibration", "probnerf", "perception"},
     "farside": {"calibration", "probnerf", "perception", "node"},
-    "examples": {"farside", "node"},  # what users would write
+    "examples": {"farside", "node", "probnerf"},  # what users would write
     "benchmarks": {"calibration", "probnerf", "perception", "node", "farside", "examples"},
 }
 PACKAGES = ("calibration", "probnerf", "perception", "node", "farside")  # installed; `benchmarks` runs from a checkout
@@ -126,8 +126,9 @@ def imported_modules(path: PurePosixPath, tree: ast.AST) -> Iterator[str]:
 
 
 def imports(path: PurePosixPath, tree: ast.AST) -> set[str]:
-    """Top-level names of the same."""
-    return {module.split(".")[0] for module in imported_modules(path, tree)}
+    """Top-level names of the same, without files beside a script of `examples`."""
+    beside = {file.stem for file in (ROOT / "examples").glob("*.py")} if path.parts[0] == "examples" else set()
+    return {module.split(".")[0] for module in imported_modules(path, tree)} - beside
 
 
 def breaks_diamond(path: PurePosixPath, tree: ast.Module) -> Iterator[str]:

@@ -2,7 +2,7 @@
 
 Objects of the test seeds from one random view each, as `farside bench calibration` takes them. A scene is an object and
 a goal 1.5 to 5 cm beside its true surface, at a random azimuth and height, to which some way in is truly free
-(`examples/reach.py`: 24 directions, shortest first). Four beliefs choose:
+(`examples/reaches.py`: 24 directions, shortest first). Four beliefs choose:
 
 - farside: the joint probability over hypotheses that the swept box is free
 - independent voxels: the product of (1 - p_occupied) of the same hypotheses over the box's voxels
@@ -30,7 +30,7 @@ from benchmarks.harness.study import PriorTableOptions, Summary
 from benchmarks.harness.tables import Table, gated, ranged
 from benchmarks.scenes.conditions import ANY, views
 from benchmarks.scenes.vessels import GRID, VesselView
-from examples.reach import Gripper, Reach, choose, reaches
+from examples.reaches import Gripper, Reach, choose, reaches
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.query import CAUTION
 from perception.answers.regions import Swept

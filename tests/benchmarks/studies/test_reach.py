@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.studies.reach import BELIEFS, FARSIDE, FREE, GRID, INDEPENDENT, OCCUPIED, Belief, tasks_of
-from examples.reach import Gripper, choose, reaches
+from examples.reaches import Gripper, choose, reaches
 from probnerf.rendering.occupancy import voxel_centres
 
 CENTRES = voxel_centres(GRID)
