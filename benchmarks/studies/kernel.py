@@ -34,8 +34,8 @@ from benchmarks.harness.rows import Row
 from benchmarks.harness.study import Summary, TableOptions
 from perception.observation.rays import observe
 from perception.observation.segmentation import segment
-from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.recording import Log
+from perception.sources.settings import SHIPPED_LOG
 from probnerf.fields.mlp import MLPField, encoded_size
 from probnerf.inference import likelihood_of, with_sizes
 from probnerf.kernel import library

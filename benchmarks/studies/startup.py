@@ -31,8 +31,8 @@ def _start(begun: float) -> dict[str, float]:
     from perception.inference.tracker import Tracker
     from perception.inference.warm_up import warm_up
     from perception.observation.segmentation import segment
-    from perception.sources.open_source import SHIPPED_LOG
     from perception.sources.recording import Log
+    from perception.sources.settings import SHIPPED_LOG
     from probnerf.prior.checkpoint import load_prior
 
     imported = time.time()

@@ -33,7 +33,7 @@ from perception.sources.playback import Playback
 from perception.sources.reader import Listener, Reader
 from perception.sources.recorder import Recorder
 from perception.sources.recording import Log
-from perception.sources.topics import TopicNames
+from perception.sources.topic_names import TopicNames
 from probnerf.prior.checkpoint import load_prior
 
 HYPOTHESES_TOPIC = "/farside/hypotheses"

@@ -6,7 +6,7 @@ from node.options import Record
 from perception.sources.playback import open_playback
 from perception.sources.recorder import Recorder
 from perception.sources.settings import RecordConfig
-from perception.sources.topics import TopicNames
+from perception.sources.topic_names import TopicNames
 
 
 def record(options: Record, out: Console, err: Console) -> None:

@@ -23,9 +23,9 @@ from perception.observation.segmentation import Segment, segment
 from perception.observation.settings import SegmentConfig
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import write_frame_folder
-from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.playback import frame_at
-from perception.sources.topics import TopicNames
+from perception.sources.settings import SHIPPED_LOG
+from perception.sources.topic_names import TopicNames
 from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.sampling.hmc import StageInfo
 from probnerf.settings import Method

@@ -11,9 +11,9 @@ from perception.inference.schedule import config_hash, digest
 from perception.inference.tracker import Look, Tracker
 from perception.observation.segmentation import Segment, segment
 from perception.sources.frame import Frame
-from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.playback import Playback, open_playback
 from perception.sources.schedule_entry import Scheduled
+from perception.sources.settings import SHIPPED_LOG
 from probnerf.prior.checkpoint import Prior, load_prior
 
 

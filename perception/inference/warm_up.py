@@ -9,8 +9,8 @@ import numpy as np
 from perception.inference.tracker import Look, Tracker
 from perception.observation.segmentation import Segment, segment
 from perception.sources.frame import Frame
-from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.recording import Log
+from perception.sources.settings import SHIPPED_LOG
 from probnerf.compile_cache import rehearsal
 from probnerf.inference import infer
 from probnerf.types import FREE, UNKNOWN, Posterior

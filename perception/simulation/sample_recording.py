@@ -14,8 +14,8 @@ from calibration.camera import Camera
 from perception.simulation.sensor_faults import SensorConfig, sense
 from perception.simulation.simulated_camera import Placed, Scene, place_camera, render
 from perception.sources.frame import Frame
-from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.recorder import write_log
+from perception.sources.settings import SHIPPED_LOG
 
 CAMERA = Camera(640, 480, np.array([[612.0, 0.0, 322.4], [0.0, 612.0, 238.7], [0.0, 0.0, 1.0]]), np.zeros(5))
 T_WORLD_CAMERA = place_camera((0.46, 0.0, 0.29), (0.0, 0.01, 0.03))

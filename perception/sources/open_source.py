@@ -6,10 +6,9 @@ from pathlib import Path
 from calibration.camera import Camera
 from perception.sources.frame import Source, StillSource
 from perception.sources.frame_folder import read_frame_folder
-from perception.sources.topics import TopicNames
+from perception.sources.settings import SHIPPED_LOG
+from perception.sources.topic_names import TopicNames
 
-# The recording that ships with the project, read when no source is named.
-SHIPPED_LOG = Path(__file__).parent / "shipped.mcap"
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
 # What a source may be, for messages.
 SOURCES = (

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from calibration.camera import Camera
 from perception.sources.frame import Frame, Source
-from perception.sources.open_source import SHIPPED_LOG, open_source
+from perception.sources.open_source import open_source
 from perception.sources.recording import Log
-from perception.sources.topics import TopicNames
+from perception.sources.settings import SHIPPED_LOG
+from perception.sources.topic_names import TopicNames
 
 
 class Playback:

@@ -25,8 +25,8 @@ from perception.sources.ros_images import (
 )
 from perception.sources.schedule_entry import SCHEDULE_TOPIC, Scheduled
 from perception.sources.stamp_matcher import Match, StampMatcher
-from perception.sources.topic_names import is_rectified
-from perception.sources.topics import TopicNames, choose, frame_of, other_camera
+from perception.sources.topic_names import TopicNames, is_rectified
+from perception.sources.topics import choose, frame_of, other_camera
 
 _KINDS = tuple(f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 _IMAGE, _COMPRESSED, _INFO = _KINDS

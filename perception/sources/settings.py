@@ -1,7 +1,11 @@
 """Settings of recordings. Standard library only, for the command line reads them without OpenCV."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
+
+# The recording that ships with the project, read when no source is named.
+SHIPPED_LOG = Path(__file__).parent / "shipped.mcap"
 
 
 @dataclass(frozen=True)

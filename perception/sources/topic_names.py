@@ -1,6 +1,7 @@
-"""What the words of a topic's name say of its images. Standard library only."""
+"""Names of topics: which are meant, and what the words of a name say of its images. Standard library only."""
 
 import re
+from dataclasses import dataclass
 
 # A depth camera's other images, and those of this node.
 NO_DEPTH_PARTS = {
@@ -22,3 +23,11 @@ def is_rectified(topic: str) -> bool:
 def named_otherwise(topic: str) -> str | None:
     """The part of a topic's name that says that its images are no depth."""
     return next(iter(sorted(NO_DEPTH_PARTS & name_parts(topic))), None)
+
+
+@dataclass(frozen=True)
+class TopicNames:
+    """Topics of a recording that are given by name; None: the one that is found."""
+
+    colour: str | None = None
+    depth: str | None = None  # taken as aligned to colour, whatever its frame_id

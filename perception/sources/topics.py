@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from perception.sources.ros_images import COLOURS, encoding_of, samples, to_depth
-from perception.sources.topic_names import NO_DEPTH_PARTS, name_parts
+from perception.sources.topic_names import NO_DEPTH_PARTS, TopicNames, name_parts
 
 _COLOUR_PARTS = {"color", "colour", "rgb"}
 _LABEL_PARTS = {"label", "labels", "segmentation"}
@@ -23,14 +23,6 @@ _INFRARED_PARTS = {"ir", "infra", "infrared", "thermal"}
 _LABEL_ENCODINGS = ("mono8", "8UC1", "mono16", "16UC1")
 _TRANSPORTS = {"compressed", "compressedDepth"}
 _NEAREST_M, _FARTHEST_M = 0.01, 50.0  # between which the median of a depth image of things on a table lies
-
-
-@dataclass(frozen=True)
-class TopicNames:
-    """Topics of a recording that are given by name; None: the one that is found."""
-
-    colour: str | None = None
-    depth: str | None = None  # taken as aligned to colour, whatever its frame_id
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from node.commands.options import LiveConfig
 from node.ros.bus import Bus
 from node.ros.messages import HYPOTHESES, NEXT_VIEW, QUERY_REGION, hypotheses_from, make
 from node.ros.settings import BusConfig
-from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.recording import Log
+from perception.sources.settings import SHIPPED_LOG
 from probnerf.prior.checkpoint import save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from tests.conftest import ROOT

@@ -21,10 +21,10 @@ from node.commands.options import LiveConfig
 from node.viewer.page import Page
 from perception.inference.tracker import Tracker, Update
 from perception.sources.frame import StillSource
-from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.reader import Reader
 from perception.sources.recorder import Recorder
 from perception.sources.recording import Log
+from perception.sources.settings import SHIPPED_LOG
 from probnerf.prior.checkpoint import save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from tests.conftest import ROOT

@@ -25,9 +25,9 @@ from perception.inference.schedule import config_hash, scheduled
 from perception.inference.settings import ControllerConfig
 from perception.observation.segmentation import Segment, segment
 from perception.sources.frame import Frame
-from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.recorder import Recorder
 from perception.sources.recording import Log
+from perception.sources.settings import SHIPPED_LOG
 from probnerf.prior.checkpoint import Prior, load_prior, save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from tests.node.commands.test_replay_whole import FEW

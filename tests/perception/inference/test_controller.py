@@ -12,8 +12,8 @@ from perception.inference.controller import Estimate, estimate
 from perception.inference.settings import ControllerConfig
 from perception.inference.warm_up import _alone
 from perception.observation.segmentation import Segment, segment
-from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.recording import Log
+from perception.sources.settings import SHIPPED_LOG
 from probnerf.prior.checkpoint import load_prior
 from probnerf.settings import InferConfig, quick_smc
 from tests.perception.inference.test_tracker import frame_from

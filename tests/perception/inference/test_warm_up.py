@@ -17,8 +17,8 @@ from perception.inference.settings import ControllerConfig
 from perception.inference.tracker import Tracker, Update
 from perception.inference.warm_up import _alone, warm_up
 from perception.observation.segmentation import segment
-from perception.sources.open_source import SHIPPED_LOG
 from perception.sources.recording import Log
+from perception.sources.settings import SHIPPED_LOG
 from probnerf import compile_cache, inference, shapes
 from probnerf.kernel import library
 from probnerf.likelihood import pixel_terms

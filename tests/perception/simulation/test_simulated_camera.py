@@ -9,7 +9,8 @@ from perception.simulation import sample_recording
 from perception.simulation.sensor_faults import SensorConfig, sense, simulate
 from perception.simulation.simulated_camera import Picture, Placed, Scene, place_camera, render, truth
 from perception.sources.frame import Frame
-from perception.sources.open_source import SHIPPED_LOG, open_source
+from perception.sources.open_source import open_source
+from perception.sources.settings import SHIPPED_LOG
 from probnerf.objects.tabletop import part_distances, signed_distance
 
 CAMERA = Camera(160, 120, np.array([[150.0, 0, 80.3], [0, 151.0, 59.1], [0, 0, 1]]), np.array([0.05, -0.1, 0, 0, 0.0]))

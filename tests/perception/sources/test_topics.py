@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from perception.sources.recording import Log
-from perception.sources.topic_names import is_rectified, name_parts
-from perception.sources.topics import TopicNames
+from perception.sources.topic_names import TopicNames, is_rectified, name_parts
 from tests.perception.sources.test_recording import MM, RGB, START, maker, record, says
 
 make = maker("mcap")
