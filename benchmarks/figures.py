@@ -70,16 +70,16 @@ def picture(name: str, summary: Summary) -> None:
 
 def page(drawn: Callable[[str, Summary], None] | None = None) -> str:
     """The text of docs/figures.md; `drawn` is given every summary that is made from rows."""
-    told = tomllib.loads((FOLDER / "transcribed.toml").read_text(encoding="utf-8"))
+    transcription = tomllib.loads((FOLDER / "transcribed.toml").read_text(encoding="utf-8"))
     links = (f"[{title}](#{title.lower().replace(' ', '-')})" for title in ORDER)
     parts = [INTRODUCTION, f"Contents: {' · '.join(links)}\n"]
     for title, names in ORDER.items():
-        sections = [section for name in names if (section := _section(name, told, drawn))]
+        sections = [section for name in names if (section := _section(name, transcription, drawn))]
         parts += [f"## {title}\n", *sections] if sections else []
     return "\n".join(parts)
 
 
-def _section(name: str, told: dict[str, Any], drawn: Callable[[str, Summary], None] | None) -> str:
+def _section(name: str, transcription: dict[str, Any], drawn: Callable[[str, Summary], None] | None) -> str:
     """One study: what it measures, its figures, its picture; "" where it has no figures."""
     source = Path(__file__).resolve().parent / "studies" / f"{name}.py"
     what = (ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or name).split("\n\n", 1)
@@ -87,14 +87,14 @@ def _section(name: str, told: dict[str, Any], drawn: Callable[[str, Summary], No
     path, kept = FOLDER / f"{name}.jsonl", kept_tables(name)
     if path.is_file():
         figures = _measured(name, read_lines(path), drawn)
-        if remark := told["remarks"].get(name):
+        if remark := transcription["remarks"].get(name):
             figures.append(remark.strip() + "\n")
     elif kept is not None:
         revision, machine, tables = kept
         figures = [*(f"{table.markdown()}\n" for table in tables), f"Revision {revision}; machine: {machine}.\n"]
-    elif (text := told["transcribed"].get(TOGETHER.get(name, name))) is not None:
-        code = f", of {told['code'][name]}" if name in told["code"] else ""
-        where = f"docs/figures.md at {told['revision']} ({told['recorded']}){code}"
+    elif (text := transcription["transcribed"].get(TOGETHER.get(name, name))) is not None:
+        code = f", of {transcription['code'][name]}" if name in transcription["code"] else ""
+        where = f"docs/figures.md at {transcription['revision']} ({transcription['recorded']}){code}"
         figures = [
             f"*Transcribed from {where}; not regenerated, revision and machine of the run not recorded.*\n",
             text,
@@ -120,10 +120,10 @@ def _measured(name: str, lines: list[Line], drawn: Callable[[str, Summary], None
         if drawn is not None and not found:
             drawn(name, summary)
         if found:
-            asked = " ".join(
+            flags = " ".join(
                 f"--{k} '{v}'" if isinstance(v, str) else f"--{k} {v}" for k, v in _changed(options).items()
             )
-            found.append(f"With `{asked}`:\n")
+            found.append(f"With `{flags}`:\n")
         found += [f"{table.markdown()}\n" for table in summary.tables]
     return [*found, _rows(same).markdown() + "\n"]
 

@@ -114,10 +114,10 @@ def selected(text: str, known: Sequence[str], what: str) -> list[str]:
 
     Raises ValueError for a name that is not known.
     """
-    asked = [part.strip() for part in text.split(";") if part.strip()] or list(known)
-    if unknown := set(asked) - set(known):
+    names = [part.strip() for part in text.split(";") if part.strip()] or list(known)
+    if unknown := set(names) - set(known):
         raise ValueError(f"no {what} {sorted(unknown)}; there are: {'; '.join(known)}")
-    return asked
+    return names
 
 
 def report(name: str, summary: Summary, options: StudyOptions) -> None:

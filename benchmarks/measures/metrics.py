@@ -1,7 +1,7 @@
-"""The measures: one definition each, one module. NumPy arrays in, Python floats out.
+"""Metrics, one definition each. NumPy arrays in, Python floats out.
 
 Symbols: S hypotheses with weights w_s (sum 1), p probabilities of occupancy, y true occupancy, G voxels per axis. A
-measure of an empty set (a stratum with no voxels, no box given as free) is NaN, and `paired_interval` leaves it out.
+metric of an empty set (a stratum without voxels, no box called free) is NaN, which `paired_interval` leaves out.
 """
 
 import numpy as np

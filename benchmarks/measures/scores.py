@@ -1,4 +1,4 @@
-"""One answer's measures on one view: unseen voxels, boxes in them, and pictures from where no camera stood."""
+"""The scores of one answer to one view: unseen voxels, boxes in them, and pictures from places without a camera."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -55,11 +55,11 @@ def shapes_at(
     likelihood: Likelihood,
     positions: Float[Array, "S d"],
     pose_sigma: Float[Array, "5"],
-    asked: Bool[Array, "g g g"],
+    region: Bool[Array, "g g g"],
 ) -> Bool[np.ndarray, "S 32 32 32"]:
     """The solid shape of each position, as `Hypotheses.solid` would have it."""
     sizeless = without_sizes(likelihood)
-    opacity = opacity_grids(model, sizeless, positions, pose_sigma, asked)
+    opacity = opacity_grids(model, sizeless, positions, pose_sigma, region)
     z = poses(model, sizeless, positions, pose_sigma).z
     return coarsen(solid(np.asarray(opacity), BASE_Z + np.asarray(z)), GRID)
 

@@ -1,10 +1,10 @@
-"""The methods that `farside bench frontier` compares: a table, and one answer from frame to grids, timed.
+"""The methods that `farside bench frontier` compares: a table, and one timed answer from frame to grids.
 
-Seconds are of one object, from the frame to its solid grids, compiled before. The cost that no machine changes is
-point_gradients, evaluations of the field with its gradient: gradients of whole positions x crossings of the view (also
-of those whose gradient the kernel leaves out because they say nothing, for every method alike). The encoder alone takes
-none, only evaluations; starts of the sampler are evaluated as well, which only seconds count. All methods are given the
-same pixels, likelihood and prior.
+Seconds are of one object, from the frame to its solid grids, with all programs compiled before. `point_gradients` is a
+cost that does not depend on the machine: evaluations of the field with its gradient, that is gradients of whole
+positions times the crossings of the view. It also counts crossings whose gradient the kernel skips because they have
+no influence, for all methods alike. The encoder alone takes only evaluations. The sampler's starts are evaluations,
+too; only seconds count them. All methods get the same pixels, likelihood and prior.
 """
 
 import time
@@ -314,7 +314,7 @@ def answer(method: Method, question: Question, short: bool = False) -> tuple[Ans
         camera = jnp.asarray(sampled.cube.to_cube(np.zeros(3)), jnp.float32)
         positions = scaled_about(model, positions, pose_sigma, camera, factor)
     view = question.view
-    asked = jnp.asarray(answered_voxels(view.frame, view.segment, sampled.cube, question.config.grid))
-    shapes = shapes_at(model, sampled.likelihood, positions, pose_sigma, asked)
+    region = jnp.asarray(answered_voxels(view.frame, view.segment, sampled.cube, question.config.grid))
+    shapes = shapes_at(model, sampled.likelihood, positions, pose_sigma, region)
     seconds = time.monotonic() - begun if sampled.seconds is None else sampled.seconds
     return Answer(shapes, weights / weights.sum(), seconds, posterior.result), sampled, positions

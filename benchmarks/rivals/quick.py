@@ -1,4 +1,4 @@
-"""Answers to one view: the posterior, and what it must beat: prior alone, encoder alone, one MAP shape."""
+"""Answers to one view by the posterior and its quick rivals: the prior alone, the encoder alone, one MAP shape."""
 
 import time
 from collections.abc import Collection
@@ -66,10 +66,10 @@ def answers(
     likelihood = likelihood_of(config.infer, observation, not vessel.pose_known)
     model, key = prior.model, jax.random.key(seed)
     dim = likelihood.dim(model)
-    asked = jnp.asarray(answered_voxels(vessel.frame, vessel.segment, cube, config.grid))
+    region = jnp.asarray(answered_voxels(vessel.frame, vessel.segment, cube, config.grid))
 
     def answer(positions: Array, weights: np.ndarray, begun: float) -> Answer:
-        shapes = shapes_at(model, likelihood, positions, observation.pose_sigma, asked)
+        shapes = shapes_at(model, likelihood, positions, observation.pose_sigma, region)
         return Answer(shapes, weights, time.monotonic() - begun)
 
     if PRIOR in methods:

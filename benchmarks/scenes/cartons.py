@@ -1,4 +1,4 @@
-"""Objects that a carton half hides from the camera."""
+"""Objects that are half hidden from the camera by a carton."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

@@ -1,14 +1,14 @@
-"""Views of objects as they come, or picked for what they hide, by condition: the first test seeds of each.
+"""Views of simulated objects by condition: the first test seeds of each.
 
-- any view: the next objects of the family as they come, any kind, from a random camera. Nothing is selected by what the
-  view hides, so a right posterior is calibrated here.
-- any view, colour only: the same without depth; the plane is the one that the camera's pose gives.
-- any view, pose known: the same, in the object's own cube, as a marker on it would tell it.
-- half hidden: as any view, with a carton before them that hides 35 to 65% of their pixels.
-- no handle in sight: as any view, cups, mugs and pitchers of which no pixel shows a handle; whether one is behind, the
-  view leaves open, and nothing was picked by it.
-- handle hidden: vessels whose handle no pixel shows. They are selected by a truth that the view leaves open (every one
-  has a handle): even a right posterior errs here, towards no handle.
+- any view: objects of the family in seed order, seen by a random camera. Nothing is selected by what the view hides,
+  so a correct posterior is calibrated here.
+- any view, colour only: the same without depth. The support plane comes from the camera's pose.
+- any view, pose known: the same in the object's own cube, as if a marker on the object gave its pose.
+- half hidden: as any view, with a carton in front that hides 35 to 65% of the object's pixels.
+- no handle in sight: as any view, of cups, mugs and pitchers without a pixel of a handle. Whether there is a handle
+  behind is not used to select them.
+- handle hidden: vessels with a handle of which no pixel shows. They are selected by a truth that the view leaves open,
+  so even a correct posterior errs here, towards no handle.
 """
 
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""What can be made worse, by growing amounts: faults of sensor and calibration, and too little of the model."""
+"""Faults of sensor and calibration of growing size, and smaller settings of the model."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,7 @@
-"""Meshes of others on the simulated table: seen by the same camera as the family's objects, with their true solid.
+"""Meshes of other sources on the simulated table, seen by the family's camera, with their true solid.
 
-A mesh is taken as a dense cloud of points on its surface, which need not be closed: pictures are the nearest points of
-a fine grid of pixels, and solid is what their voxels are or enclose.
+A mesh is sampled as a dense cloud of surface points and need not be closed. A picture shows the nearest point in each
+cell of a fine pixel grid. The solid is every voxel that holds a point, and every voxel that these enclose.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Vessels on a simulated table whose handle no pixel shows, or many do, with the truth in the view frame."""
+"""Vessels on a simulated table, with the handle hidden or in sight, and the truth in the frame of the view."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -130,7 +130,7 @@ def vessel_view(
     placed, camera, seed = picture.placed, picture.camera, picture.placed.seed
     frame = sense(picture.picture, camera, picture.T_world_camera, seed)
     if not depth:
-        frame = replace(frame, depth=None, T_world_camera=told_pose(picture.T_world_camera, seed))
+        frame = replace(frame, depth=None, T_world_camera=pose_as_stated(picture.T_world_camera, seed))
     frame = frame if fault is None else fault(frame)
     found = segment(frame, 1)[0]
     if pose_known:
@@ -162,13 +162,13 @@ def in_table(grid: int) -> Bool[np.ndarray, "g"]:
     return ~above_plane(grid)
 
 
-def told_pose(T_world_camera: Float[np.ndarray, "4 4"], seed: int) -> Float[np.ndarray, "4 4"]:
+def pose_as_stated(T_world_camera: Float[np.ndarray, "4 4"], seed: int) -> Float[np.ndarray, "4 4"]:
     """A camera's pose as its user tells it: height and tilt err by what `PlaneGuess` states, drawn by the seed."""
     stated, rng = PlaneGuess(), np.random.default_rng([seed, 53])
-    told = T_world_camera.copy()
-    told[2, 3] += rng.normal(0.0, stated.height_sigma)
-    told[:3, :3] @= Rotation.from_euler("x", rng.normal(0.0, stated.tilt_sigma), degrees=True).as_matrix()
-    return told
+    T_stated = T_world_camera.copy()
+    T_stated[2, 3] += rng.normal(0.0, stated.height_sigma)
+    T_stated[:3, :3] @= Rotation.from_euler("x", rng.normal(0.0, stated.tilt_sigma), degrees=True).as_matrix()
+    return T_stated
 
 
 def hidden_vessel(seed: int, config: ViewConfig | None = None) -> VesselView | None:

@@ -1,16 +1,17 @@
-"""Acceptance of HMC against its step, by renderer: the foam's exact pictures, and quadrature along the ray.
+"""Acceptance of HMC against its step size, by renderer: the foam's exact pictures, and quadrature along the ray.
 
-As the paper's figure (sections 2.5 and 4.2): z~ is drawn from the prior, one picture of its shape is rendered, so that
-z~ is a draw of the posterior given that picture, and eight chains start from it; after 20 iterations of 10 leapfrog
-steps at one step size, the mean Metropolis acceptance of the last iteration. Pose known, pixel colours on white with
-Gaussian errors of 0.1, no range. Every renderer explains a picture of its own:
+As in the paper's figure (sections 2.5 and 4.2): z~ is drawn from the prior and one picture of its shape is rendered,
+so z~ is a draw of the posterior given that picture. Eight chains start from it. After 20 iterations of 10 leapfrog
+steps at one step size, the figure is the mean Metropolis acceptance of the last iteration. The pose is known; pixel
+colours are on white with Gaussian errors of 0.1; there is no range. Each renderer explains a picture that it rendered
+itself:
 
 - foam: compositing at the crossings of the lattice's faces (`probnerf.rendering.foam`)
-- quadrature: as many even steps between the cube's ends of the ray, piecewise constant density
-- quadrature, importance samples: half of its samples where the other half saw weight (NeRF's fine pass); as there, no
-  gradient runs through their places
+- quadrature: the same number of even steps between the ends of the ray in the cube, with piecewise constant density
+- quadrature, importance samples: half of the samples are placed where the other half has weight (NeRF's fine pass). As
+  there, no gradient passes through their places.
 
-All three on the shipped prior, which was trained through the foam; the paper trained one for each.
+All three use the shipped prior, which was trained through the foam. The paper trained one prior for each.
 """
 
 from collections.abc import Callable

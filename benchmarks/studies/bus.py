@@ -71,7 +71,7 @@ def main(options: Options) -> Summary:
             times[region] = _times(
                 lambda: bus.call("/echo/query_region", QUERY_REGION, ask, _WAIT_S), max(20, trips // 10)
             )
-            sent, came, seconds = _throughput(bus, trips)
+            sent, received, seconds = _throughput(bus, trips)
         with _peer(endpoint, "stuck", 1, 1) as process:
             publisher = bus.publisher("/image", _IMAGE)
             _until(lambda: publisher.wanted)
@@ -86,8 +86,8 @@ def main(options: Options) -> Summary:
         for metric, value in (("median", np.median(ms)), ("p99", np.quantile(ms, 0.99)), ("max", ms.max())):
             rows.append(Row("bus", "zenoh, tcp", condition, metric, float(value), "ms", len(ms)))
     condition = "640x480 RGB as fast as they go"
-    rows.append(Row("bus", "zenoh, tcp", condition, "received", came / seconds, "1/s", came))
-    rows.append(Row("bus", "zenoh, tcp", condition, "lost", 1.0 - came / sent, "", sent))
+    rows.append(Row("bus", "zenoh, tcp", condition, "received", received / seconds, "1/s", received))
+    rows.append(Row("bus", "zenoh, tcp", condition, "lost", 1.0 - received / sent, "", sent))
     return Summary(rows, picture=lambda: _draw(times))
 
 
@@ -177,16 +177,16 @@ def _times(act: Callable[[], object], count: int) -> Float[np.ndarray, "n"]:
 
 
 def _round_trips(bus: Bus, message: Any, count: int) -> Float[np.ndarray, "n"]:
-    came = threading.Event()
-    bus.subscribe("/pong", _IMAGE, lambda _: came.set())
+    arrival = threading.Event()
+    bus.subscribe("/pong", _IMAGE, lambda _: arrival.set())
     publisher = bus.publisher("/ping", _IMAGE)
     _until(lambda: publisher.wanted)
-    _until(lambda: publisher.publish(message) and came.wait(0.2))  # and /pong is known over there
+    _until(lambda: publisher.publish(message) and arrival.wait(0.2))  # and /pong is known over there
 
     def trip() -> None:
-        came.clear()
+        arrival.clear()
         publisher.publish(message)
-        if not came.wait(_WAIT_S):
+        if not arrival.wait(_WAIT_S):
             raise TimeoutError("an image did not come back from the benchmark's other process")
 
     time.sleep(0.5)  # what is still on its way comes home

@@ -1,16 +1,19 @@
-"""Does p_occupied mean what it says: the posterior and its rivals over unseen space, objects of every kind.
+"""Whether p_occupied is calibrated in unseen space: the posterior and its rivals on objects of every kind.
 
-Test seeds, the whole path from frame to hypotheses, under the conditions of `scenes.conditions`. Prior, encoder and MAP
-answer all of them; mean-field VI and the paper's annealed HMC (its last 16 states), which take long, the first `slow`.
+Test seeds, and the whole path from frame to hypotheses, under the conditions of `scenes.conditions`. Prior, encoder
+and MAP answer all of them. Mean-field VI and the paper's annealed HMC (its last 16 states) take long and answer the
+first `slow` ones.
 
-Measures: as `farside bench hidden`, over unseen voxels whose training-set frequency lies in (0.02, 0.98), smoothed
-alike. energy_score: of whole shapes, over all unseen voxels. hidden_ece here pools the voxels of all objects (15 bins);
-voxels of one object err together, so that its 95% interval is a bootstrap over objects. mean_iou and best_of_8_iou are
-of whole shapes. wrong_at_R: of the random unseen boxes with p_free of 1 - R or more, the share that is truly occupied;
-free_at_R: the share of all boxes that they are. Ranks count the truth as one more draw, so that a single shape would
-cover anything: MAP has none.
-
-Results are appended to a file, object by object, and what is there is not made again.
+- hidden_nll, hidden_brier: as in `farside bench hidden`, over unseen voxels whose training-set frequency lies in
+  (0.02, 0.98), with the same smoothing.
+- energy_score: of whole shapes, over all unseen voxels.
+- hidden_ece: pools the voxels of all objects in 15 bins. Voxels of one object err together, so its 95% interval is a
+  bootstrap over objects.
+- mean_iou, best_of_8_iou: of whole shapes.
+- coverage90: share of the boxes whose true volume lies in the central 90% of the answer's. Ranks count the truth as
+  one more draw, so a single shape would cover everything: MAP has no rank.
+- wrong_at_R, free_at_R: of the random unseen boxes with p_free of 1 - R or more, the share that is truly occupied; and
+  their share of all boxes.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -119,9 +122,9 @@ def _measure(options: Options, prior: Prior, results: Results) -> None:
     common = {"prior": prior.hash, "seed": seed}
     settings = _settings(config, rivals, options.quick)
     rates = {k: base_rate(128 if options.quick else 1024, config=config.observe, pose_known=k) for k in (False, True)}
-    asked = selected(options.conditions, list(SORTS), "condition")
+    conditions = selected(options.conditions, list(SORTS), "condition")
     for condition, methods, count in (
-        (c, m, k) for c in asked for m, k in ((METHODS, options.n), (tuple(SLOW), options.slow))
+        (c, m, k) for c in conditions for m, k in ((METHODS, options.n), (tuple(SLOW), options.slow))
     ):
 
         def missing(number: int, condition: str = condition, methods: tuple[str, ...] = methods) -> dict[str, Line]:
@@ -132,13 +135,13 @@ def _measure(options: Options, prior: Prior, results: Results) -> None:
         for number, view in views(condition, min(count, options.n), lambda number: not missing(number)):
             if view is None:
                 continue
-            asked_of = missing(number)
-            given = answers(view, prior, config, rivals, seed, None, 240, [m for m in asked_of if m in METHODS])
+            missing_lines = missing(number)
+            given = answers(view, prior, config, rivals, seed, None, 240, [m for m in missing_lines if m in METHODS])
             question = Question(view, prior, config, seed)
-            given |= {m: answer(SLOW[m], question)[0] for m in asked_of if m in SLOW}
+            given |= {m: answer(SLOW[m], question)[0] for m in missing_lines if m in SLOW}
             judgements = {m: judged(view, a, rates[view.pose_known], seed) for m, a in given.items()}
             for method, found in judgements.items():
-                results.add({**asked_of[method], **found})
+                results.add({**missing_lines[method], **found})
             say(f"{condition}, {number}: " + ", ".join(f"{m} {v['hidden_nll']:.3f}" for m, v in judgements.items()))
 
 
@@ -190,8 +193,8 @@ def called_free(p_free: Float[np.ndarray, "n"], occupied: Bool[np.ndarray, "n"])
 
 def summary(lines: list[Line], options: Options) -> Summary | None:
     """Figures of the conditions that are asked for; None where there are no rows of them."""
-    asked = selected(options.conditions, list(SORTS), "condition")
-    lines = _answered_by_all([line for line in lines if line["condition"] in asked])
+    conditions = selected(options.conditions, list(SORTS), "condition")
+    lines = _answered_by_all([line for line in lines if line["condition"] in conditions])
     if not lines:
         return None
     rows = _rows(lines)

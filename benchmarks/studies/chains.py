@@ -1,17 +1,15 @@
-"""Where samplers get stuck, and how wide their answers are: chains side by side, and draws of what nobody saw.
+"""Where samplers get stuck, and how wide their answers are: chains side by side, and the spread of unseen volume.
 
-The views of `farside bench stability`. Per method:
+The views of `farside bench stability`. For each method:
 
-- unexplained: share of the view's telling pixels that a chain (or population) leaves unexplained, mean of its samples;
-  its mean, its standard deviation over the chains of a view and the worst chain's, means over views. A chain that is
-  stuck in a wrong mode stands out. Annealed HMC begins hot and cools; at a fixed temperature the same number of steps
-  is spent at the likelihood's own scale (the paper's figure of multimodality).
-- volume_sd: standard deviation over the answer's draws of the volume that is solid where nobody saw, over its mean.
-  Variational inference fits one Gaussian, which falls into one mode: its draws agree where others' do not.
-- rounding (of tempered_smc alone): how far the kernel's float32 log-likelihood is from plain JAX in float64 at the
-  samples: the largest error of a difference between two samples, nats; these differences are what samplers see.
-
-Answers are appended to a file as they come, and what is there is not made again.
+- unexplained: share of the view's informative pixels that a chain (or population) leaves unexplained, mean over its
+  samples. The table has its mean, its standard deviation over the chains of a view, and the worst chain's value, all
+  as means over views. A chain that is stuck in a wrong mode stands out. Annealed HMC begins hot and cools. At a fixed
+  temperature, the same number of steps is spent at the likelihood's own scale (the paper's figure of multimodality).
+- volume_sd: standard deviation over the answer's draws of the solid volume in unseen space, over its mean. Variational
+  inference fits one Gaussian, which falls into one mode, so its draws agree where those of other methods differ.
+- rounding (tempered_smc only): the largest error of the kernel's float32 log-likelihood against plain JAX in float64,
+  as a difference between two samples, nats. Samplers use only such differences.
 """
 
 from dataclasses import dataclass, replace

@@ -1,10 +1,10 @@
-"""No more model than a scene needs: what the controller spends on easy scenes and on hard ones.
+"""Cost of easy and of hard scenes: no more model than a scene needs.
 
-Easy: a plain can without a handle, nothing before it, seen from 30 to 50 degrees above. Hard: a printed pitcher of
-which a carton hides 35 to 65% of the pixels. Test seeds, RGB-D, the whole path from frame to hypotheses, at one
+Easy: a plain can without a handle, nothing in front of it, seen from 30 to 50 degrees above. Hard: a printed pitcher
+of which a carton hides 35 to 65% of the pixels. Test seeds, RGB-D, the whole path from frame to hypotheses, at one
 tolerance; beside it the largest model for every scene. Cost is field evaluations with gradient, and seconds from the
-frame to the last answer (compiled before); first_answer is the first one that can be published. hidden_nll is that of
-`farside bench hidden`.
+frame to the last answer (programs compiled before). first_answer is the time of the first answer that can be
+published. hidden_nll is that of `farside bench hidden`.
 """
 
 import resource
@@ -102,20 +102,20 @@ def main(options: Options) -> Summary:
 
     def measured(view: VesselView, amount: ControllerConfig) -> tuple[dict[str, float], Estimate]:
         """One scene's figures with one amount of model, by metric, and what they are of."""
-        begun, told = time.monotonic(), list[float]()
+        begun, times = time.monotonic(), list[float]()
         found = estimate(
             view.frame,
             view.segment,
             loaded,
             amount,
             seed=seed,
-            on_answer=lambda _: told.append(time.monotonic() - begun),
+            on_answer=lambda _: times.append(time.monotonic() - begun),
         )
         h = found.hypotheses
         rng = np.random.default_rng([seed, view.seed, 31])
         boxes = random_boxes(scored_voxels(view.seen, rate), 1, rng)
         judged = score(view, Answer(coarsen(h.solid, GRID), h.weights, found.seconds), rate, boxes, rng)
-        cost = {"point_gradients": h.diagnostics["point_gradients"], "first_answer": told[0], "seconds": told[-1]}
+        cost = {"point_gradients": h.diagnostics["point_gradients"], "first_answer": times[0], "seconds": times[-1]}
         parts = {part: found.parts.get(part, 0.0) for part in PARTS}
         return {**cost, **parts, "hidden_nll": judged.values["hidden_nll"]}, found
 

@@ -1,21 +1,22 @@
 """A real frame (YCB-Video 000002): hypotheses against the true models, with and without a given label.
 
-Read in place from ../shared/data/ycbv_000002 beside the checkout. Per object (1 coffee can, 11 pitcher, 3 sugar box,
-9 meat can) the whole path from frame to hypotheses; without labels the segment of largest IoU with the object's label.
-Nothing is tuned on the pitcher, the sugar box or the meat can.
+The frame is read from ../shared/data/ycbv_000002 beside the checkout. Each object (1 coffee can, 11 pitcher, 3 sugar
+box, 9 meat can) takes the whole path from frame to hypotheses. Without labels, an object is the segment with the
+largest IoU with its label. Nothing was tuned on the pitcher, the sugar box or the meat can.
 
 - chamfer: symmetric Chamfer distance between a hypothesis' surface (centres of exposed voxel faces) and the true
   model's points at the true pose, mm; the weighted median over hypotheses.
 - p_within_one_voxel: on the true surface points at least 10 mm behind the measured depth, the mean of the largest
   p_occupied among the 27 voxels about the point.
-- p_three_voxels_outside: mean p_occupied three voxels outside those points, along their normals (from 12 neighbours,
-  away from the model's centre), where that is above the plane, at least 10 mm behind the measured depth, and at least
-  two voxels from every true surface point.
-- log_score: half the mean -log p_occupied over hidden surface points (as above) plus half the mean
-  -log(1 - p_occupied) over unseen free points: uniform in the model's box enlarged by 6 cm, above the plane, at least
-  10 mm behind the measured depth, outside every model's box by 5 mm and 15 mm from any true surface; probabilities
-  clipped at 0.001.
-- seconds: from the frame in memory to the hypotheses, programs compiled before (`segment` finds all objects at once).
+- p_three_voxels_outside: mean p_occupied three voxels outside those points along their normals (from 12 neighbours,
+  away from the model's centre). Only points above the plane, at least 10 mm behind the measured depth, and at least
+  two voxels from every true surface point count.
+- log_score: half the mean -log p_occupied over hidden surface points (as above) plus half the mean -log(1 -
+  p_occupied) over unseen free points. These are uniform in the model's box enlarged by 6 cm, above the plane, at least
+  10 mm behind the measured depth, outside every model's box by 5 mm, and 15 mm from any true surface. Probabilities
+  are clipped at 0.001.
+- seconds: from the frame in memory to the hypotheses, with programs compiled before (`segment` finds all objects at
+  once).
 """
 
 import json

@@ -1,22 +1,20 @@
-"""The frontier: accuracy against time of the posterior's sampler, its shortcuts and its rivals, from one view.
+"""Accuracy against time of the posterior's sampler, its variants and its rivals, from one view.
 
-The first vessels of the test seeds with a handle for which there is a view that hides it and one that shows it clearly
-(`scenes.vessels`), each with depth and without; what perception refuses is left out. Methods are those of
-`rivals.methods`, all smoothed alike, each timed on one object at a time, compiled before. Measures:
+The first vessels of the test seeds with a handle for which one view hides it and one shows it clearly
+(`scenes.vessels`), each with depth and without. Views that perception refuses are left out. The methods are those of
+`rivals.methods`, all smoothed alike, each timed on one object at a time, with programs compiled before.
 
-- hidden_nll, hidden_nll_handle, coverage90, ks, falsely_free: as `farside bench hidden`. Boxes are the same for all
-  methods. The frequency of occupancy is that of RGB-D's widths in all conditions.
+- hidden_nll, hidden_nll_handle, coverage90, ks, falsely_free: as in `farside bench hidden`. All methods get the same
+  boxes. The frequency of occupancy is that of RGB-D's widths in all conditions.
 - psnr_heldout: the object alone on white, from behind and from one side, 48 x 48 pixels, mean over 8 hypotheses drawn
-  by weight; psnr_heldout_of_mean: of their mean picture; psnr_given: from the view's own place.
-- seconds: of one object, from frame to solid grids; work: seconds x the speed of the machine's matrix product beside
-  them, which another machine can be compared by.
+  by weight. psnr_heldout_of_mean: of their mean picture. psnr_given: from the view's own place.
+- seconds: of one object, from frame to solid grids. work: seconds times the speed of the machine's matrix product
+  beside them, for comparison with another machine.
 - point_gradients: see `rivals.methods`. The encoder alone has point_evaluations.
 - hidden_nll_above_paper, _above_base: paired over objects with the paper's full schedule, and with one run of the
-  sampler, from which levers are taken one at a time (delta is added to the one that begins at the prior).
-- over all conditions: each vessel's mean of them, which are not independent, beside the paper's schedule's, and how
-  many times more it takes: fewer_point_gradients, less_work.
-
-Results are appended to a file, vessel by vessel, and what is there is not made again: Ctrl-C any time, and go on later.
+  sampler. A lever changes one thing of that run (delta is added to the run that begins at the prior).
+- over all conditions: the mean of each vessel's four conditions, which are not independent, beside the paper's
+  schedule; and the ratio of costs, fewer_point_gradients and less_work.
 """
 
 from collections.abc import Sequence
@@ -99,8 +97,8 @@ def main(options: Options) -> Summary:
 
 
 def _matches(names: Sequence[str], patterns: str) -> bool:
-    asked = [p.strip() for p in patterns.split(";") if p.strip()]
-    return not asked or any(fnmatch(name, p) for name in names for p in asked)
+    each = [p.strip() for p in patterns.split(";") if p.strip()]
+    return not each or any(fnmatch(name, p) for name in names for p in each)
 
 
 def _measure(options: Options, prior: Prior, results: Results) -> None:
@@ -114,14 +112,14 @@ def _measure(options: Options, prior: Prior, results: Results) -> None:
         if vessels == options.n:
             break
         common = {"prior": prior.hash, "object": number, "seed": options.seed}
-        asked = [
+        missing = [
             {"method": m.name, "settings": settings_of(m, config), "condition": c, **common}
             for c in conditions
             for m in methods
             if c in m.conditions and _refusal(c, common) not in results
         ]
-        asked = [line for line in asked if line not in results]
-        if not asked and number in known:
+        missing = [line for line in missing if line not in results]
+        if not missing and number in known:
             vessels += 1
             continue
         hidden = vessel_picture(number, "hidden")
@@ -131,7 +129,7 @@ def _measure(options: Options, prior: Prior, results: Results) -> None:
         vessels += 1
         rate = base_rate(config=config.observe) if rate is None else rate
         for condition in conditions:
-            left = [line for line in asked if line["condition"] == condition]
+            left = [line for line in missing if line["condition"] == condition]
             if not left:
                 continue
             handle, depth = condition.split(", ")
@@ -234,9 +232,9 @@ def _over_all(lines: Sequence[Line]) -> list[Row]:
     return rows
 
 
-def _method_rows(asked: Method, condition: str, own: Sequence[Line], score: dict[tuple[str, int], float]) -> list[Row]:
+def _method_rows(entry: Method, condition: str, own: Sequence[Line], score: dict[tuple[str, int], float]) -> list[Row]:
     """One method's rows; `score` is the hidden_nll of every method and object."""
-    name, method, rows = "frontier", asked.name, list[Row]()
+    name, method, rows = "frontier", entry.name, list[Row]()
     for metric, unit in UNITS.items():
         values = [line.get(metric, np.nan) for line in own]
         if metric == "work":
@@ -247,7 +245,7 @@ def _method_rows(asked: Method, condition: str, own: Sequence[Line], score: dict
     ranks, p_free, occupied = (np.concatenate([line[k] for line in own]) for k in ("ranks", "p_free", "occupied"))
     rows.append(Row(name, method, condition, "ks", ks_distance(ranks), "", len(ranks)))
     rows.append(Row(name, method, condition, "falsely_free", falsely_free(p_free, occupied > 0), "", len(ranks)))
-    for word, other in (("paper", FULL), ("base", asked.base)):
+    for word, other in (("paper", FULL), ("base", entry.base)):
         both = [(x["hidden_nll"], score[other, x["object"]]) for x in own if (other, x["object"]) in score]
         if both and method != other:
             rows += gap_rows(name, method, condition, f"hidden_nll_above_{word}", *np.array(both).T)

@@ -1,14 +1,16 @@
-"""Is a handle behind it? How likely the answer's shapes say so, against how often one is.
+"""Is a handle behind it? The probability that the answer's shapes give, against how often there is one.
 
-Cups, mugs and pitchers of which no pixel shows a handle, not picked by whether one is there ("no handle in sight" of
-`scenes.conditions`): test seeds, RGB-D, the whole path. Each shape of an answer is decoded in the canonical frame, its
-handle at +x, and has one if it reaches farther past its body there than any of the family does without (`reach`). p is
-the share of the answer's weight on shapes that do.
+Cups, mugs and pitchers without a pixel of a handle, not selected by whether there is one ("no handle in sight" of
+`scenes.conditions`): test seeds, RGB-D, the whole path. Each shape of an answer is decoded in the canonical frame,
+with its handle at +x. It has a handle if it reaches farther past its body there than any shape of the family without
+one (`reach`). p is the share of the answer's weight on shapes with a handle.
 
-Measures: said and true, the mean p and the share of objects with a handle, of all and by p; log_score and brier of p;
-hidden_nll as `farside bench hidden`. "the prior alone" says of each object how many of the prior's shapes have a
-handle. "from the prior" is the controller that does not begin at modes. Results are appended to a file, object by
-object, and what is there is not made again.
+- p, share: the mean p and the share of objects with a handle, over all objects and in bins of p.
+- log_score, brier: of p.
+- hidden_nll: as in `farside bench hidden`.
+
+"the prior alone" gives each object the share of the prior's shapes with a handle. "from the prior" is the controller
+that does not begin at modes.
 """
 
 from collections.abc import Sequence
@@ -47,9 +49,9 @@ COLOURS = dict(zip((m.name for m in ASKED), ("tab:blue", "tab:purple", "tab:oran
 REACH = 2.25  # voxels: the family's shapes reach at most 0 without a handle and at least 4 with one
 EDGES = (0.0, 0.05, 0.3, 0.6, 1.0)  # of p
 PRIOR_SHAPES = 1000
-UNITS = {"said": "", "true": "", "log_score": "nats", "brier": "", "hidden_nll": "nats", "point_gradients": ""}
+UNITS = {"p": "", "share": "", "log_score": "nats", "brier": "", "hidden_nll": "nats", "point_gradients": ""}
 COMPARED = ("log_score", "hidden_nll")  # with the controller's
-MEASURES = ("said", "true", "log_score", "brier", "hidden_nll")
+MEASURES = ("p", "share", "log_score", "brier", "hidden_nll")
 
 
 def reach(shapes: Bool[np.ndarray, "s x y z"]) -> Float[np.ndarray, "s"]:
@@ -166,8 +168,8 @@ def summary(lines: list[Line], options: Options) -> Summary | None:
     if not lines or not alone:
         return None
     own = [x for x in lines if x["method"] == OWN] or [x for x in lines if x["method"] == lines[0]["method"]]
-    says = {"method": PRIOR, "p": alone[-1]["p"], "shapes": PRIOR_SHAPES}
-    rows = _rows([*lines, *({**says, "object": x["object"], "handle": x["handle"]} for x in own)])
+    alone_row = {"method": PRIOR, "p": alone[-1]["p"], "shapes": PRIOR_SHAPES}
+    rows = _rows([*lines, *({**alone_row, "object": x["object"], "handle": x["handle"]} for x in own)])
     return Summary(rows, _tables(Figures(rows)), lambda: _draw(lines))
 
 
@@ -181,8 +183,8 @@ def _rows(lines: Sequence[Line]) -> list[Row]:
         values, objects = _values(own), objects_of(own)
         for metric, each in values.items():
             rows += mean_rows("handle", method, BEHIND, metric, each, UNITS[metric])
-        for low, high, inside in _bins(values["said"]):
-            for metric in ("said", "true"):
+        for low, high, inside in _bins(values["p"]):
+            for metric in ("p", "share"):
                 where, mean = f"{metric} where p is {low:g} to {high:g}", float(values[metric][inside].mean())
                 rows.append(Row("handle", method, BEHIND, where, mean, "", int(inside.sum())))
         if method == OWN:
@@ -201,23 +203,23 @@ def _tables(of: Figures) -> list[Table]:
         cells = [ranged(of.interval(BEHIND, method, m)) if (BEHIND, method, m) in of else "" for m in MEASURES]
         above = [f"{metric}_above_controller" for metric in COMPARED]
         cells += [ranged(of.interval(BEHIND, method, m), sign="+") if (BEHIND, method, m) in of else "" for m in above]
-        means.append([method, str(of.count(BEHIND, method, "said")), *cells])
+        means.append([method, str(of.count(BEHIND, method, "p")), *cells])
         for low, high in pairwise(EDGES):
-            names = [f"{metric} where p is {low:g} to {high:g}" for metric in ("said", "true")]
+            names = [f"{metric} where p is {low:g} to {high:g}" for metric in ("p", "share")]
             if method != PRIOR and (BEHIND, method, names[0]) in of:
                 pair = (f"{of(BEHIND, method, name):.3f}" for name in names)
                 shares.append([method, f"{low:g} to {high:g}", str(of.count(BEHIND, method, names[0])), *pair])
     header = ("method", "n", *MEASURES, *(f"{metric} above the controller's" for metric in COMPARED))
     return [
         Table("Is a handle behind it?", header, means),
-        Table("By what was said", ("method", "p", "objects", "mean p", "share with a handle"), shares),
+        Table("By p", ("method", "p", "objects", "mean p", "share with a handle"), shares),
     ]
 
 
 def _values(lines: Sequence[Line]) -> dict[str, Float[np.ndarray, "n"]]:
     """One method's measures, object by object."""
     p, true, shapes = (np.array([x[name] for x in lines]) for name in ("p", "handle", "shapes"))
-    values = {"said": p, "true": true * 1.0, "log_score": log_score(p, true, shapes), "brier": (p - true) ** 2}
+    values = {"p": p, "share": true * 1.0, "log_score": log_score(p, true, shapes), "brier": (p - true) ** 2}
     return values | {m: np.array([x[m] for x in lines]) for m in ("hidden_nll", "point_gradients") if m in lines[0]}
 
 
@@ -228,7 +230,7 @@ def _bins(p: Float[np.ndarray, "n"]) -> list[tuple[float, float, Bool[np.ndarray
 
 
 def _draw(lines: Sequence[Line]) -> Figure:
-    """What each method said of objects with a handle and without; said against true, in bins of what was said."""
+    """What each method said of objects with a handle and without; p against what is there, in bins of p."""
     figure = Figure(figsize=(11, 4.4), layout="constrained")
     each, bins = figure.subplots(1, 2, width_ratios=(3, 2))
     names = [m.name for m in ASKED if any(x["method"] == m.name for x in lines)]
@@ -243,12 +245,14 @@ def _draw(lines: Sequence[Line]) -> Figure:
         filled = [inside for _, _, inside in _bins(p) if inside.sum() > 2]
         share = np.array([true[inside].mean() for inside in filled])
         error = 1.96 * np.sqrt(share * (1 - share) / np.array([inside.sum() for inside in filled]))
-        said = [p[inside].mean() for inside in filled]
-        bins.errorbar(said, share, error, fmt="o-", color=COLOURS[name], capsize=3, ms=5, label=name)
+        mean_p = [p[inside].mean() for inside in filled]
+        bins.errorbar(mean_p, share, error, fmt="o-", color=COLOURS[name], capsize=3, ms=5, label=name)
     each.set_xticks(range(len(names)), [f"{n}\n({sum(x['method'] == n for x in lines)})" for n in names], fontsize=9)
-    each.set(ylabel="P(a handle is behind)", ylim=(-0.03, 1.03), title="what was said of each object")
+    each.set(ylabel="P(a handle is behind)", ylim=(-0.03, 1.03), title="p of each object")
     each.legend(fontsize=9)
     bins.plot([0, 1], [0, 1], "k--", linewidth=1)
-    bins.set(xlabel="P(a handle is behind)", ylabel="share with one", title="said and true", ylim=(-0.05, 1.05))
+    bins.set(
+        xlabel="P(a handle is behind)", ylabel="share with one", title="p against what is there", ylim=(-0.05, 1.05)
+    )
     bins.legend(fontsize=9)
     return figure

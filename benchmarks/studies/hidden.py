@@ -1,17 +1,17 @@
 """Hidden handles: how well the posterior and three rivals predict what one RGB-D view of a vessel does not show.
 
-Vessels of the test seeds with a handle, each in a simulated view in which no pixel shows it (`scenes.vessels`), yaw
+Vessels of the test seeds with a handle, each in a simulated view without a pixel of it (`scenes.vessels`); yaw
 unknown, the whole path from frame to hypotheses. Four methods answer the same observation (`rivals.quick`), all
-smoothed alike. Measures are taken per vessel, at 32^3 in the view's cube, then averaged:
+smoothed alike. Measures are taken per vessel, on 32^3 voxels of the view's cube, then averaged:
 
 - hidden_nll, hidden_brier, hidden_ece: over the voxels that are truly unseen (by the true geometry) and whose
   training-set frequency of occupancy (family objects at any yaw, placed by perception's widths) lies in (0.02, 0.98).
-- hidden_nll on the handle stratum: those of them outside the true body that the true handle would occupy at some yaw.
-- seconds: without the first vessel's, when the rivals compile (the posterior's own programs are compiled before).
+- hidden_nll_handle: over those of them outside the true body that the true handle would occupy at some yaw.
+- seconds: without the first vessel, for which the rivals compile (the posterior's programs are compiled before).
 - coverage90, ks, falsely_free: of the occupied volume in random unseen boxes (2 to 10 voxels a side about a scored
-  voxel; what was seen in them does not count), by randomised ranks.
+  voxel; the seen part of a box does not count), by randomised ranks.
 
-All vessels have a handle, while the view leaves open whether there is one: ranks are reported as they are.
+All vessels have a handle, while the view leaves open whether there is one. Ranks are reported as they are.
 """
 
 from collections.abc import Sequence

@@ -1,16 +1,16 @@
-"""Taking frames in and recording them: a camera's 640x480 RGB-D at 30 Hz while inference runs and planners ask.
+"""Taking frames in and recording them: a camera's 640x480 RGB-D at 30 Hz, alone and beside inference and queries.
 
 A synthetic camera gives frames (the shipped recording's, with a camera's noise) by its own clock into a `Reader`. A
-listener records every frame. With the condition "inference", another thread takes the newest frame as often as it can
-and samples one stage of the default posterior of its first object, and a third asks for 1000 points of the hypotheses
+listener records every frame. Under the condition "inference", a second thread takes the newest frame as often as it
+can and samples one stage of the default posterior of its first object; a third asks for 1000 points of the hypotheses
 twenty times a second. "idle" is the same without these two.
 
-- frames_due: what the camera's clock gave in the time; frames_in: what the reader received of it. The camera
-  keeps the last four frames, as drivers do: one that is later than four periods is dropped.
-- recorded: frames in the file. lost: frames due that are not, for whatever reason.
+- frames_due: frames by the camera's clock. frames_in: frames that the reader received. The camera keeps the last four
+  frames, as drivers do; a frame that is later than four periods is dropped.
+- recorded: frames in the file. lost: frames due that are not in the file, for any reason.
 - newest_skipped: frames that inference passed over for a newer one, as it must.
-- newest_age: from the frame's stamp to its being handed to inference, median and 95th percentile.
-- listener_age: the same for the recording.
+- newest_age: from the frame's stamp to inference, median and 95th percentile.
+- listener_age: the same to the recording.
 - query: from a question to its answer, in this process, median and 99th percentile.
 """
 

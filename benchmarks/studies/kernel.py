@@ -1,19 +1,19 @@
-"""The fused kernel: operations a second beside the machine's matrix products and beside the same work in plain JAX.
+"""The fused kernel: operations per second beside the machine's matrix product and beside the same work in plain JAX.
 
-One value and gradient of the pixel likelihood for every particle. All paths and the machine's own matrix product are
-timed in turn, round after round, and medians are given: their ratios hold on a machine that does other work, too.
+One value and gradient of the pixel likelihood for every particle. All paths and the machine's matrix product are timed
+in turn, round after round, and medians are given, so ratios also hold on a machine that does other work.
 
-- operations: two for each multiply-add of the two networks at the crossings that a pixel can tell of, times three
-  (forwards, and backwards by inputs and by weights); encodings, compositing and the likelihood's terms are not counted.
-  All crossings are counted, as plain JAX evaluates them, though the kernel passes over colours and gradients of those
-  that say nothing: in sharp shapes nine of ten. In "haze" every one counts, and the share is the machine's work.
-- least_bytes: weights in and their gradient out; what the fused operation has to move. stored_bytes: every layer's
-  values at every crossing, which the plain path writes and reads again.
+- operations: two for each multiply-add of the two networks at the crossings that a pixel depends on, times three
+  (forwards, and backwards by inputs and by weights). Encodings, compositing and the likelihood's terms are not
+  counted. All crossings are counted, as plain JAX evaluates them. The kernel skips colours and gradients of crossings
+  without influence: in sharp shapes nine of ten. In "haze" every crossing counts, and the share is the machine's work.
+- least_bytes: weights in and their gradient out, which the fused operation has to move. stored_bytes: the values of
+  every layer at every crossing, which the plain path writes and reads again.
 - share_of_peak: of the machine's single-precision matrix product, 4096 x 4096, in the same rounds.
-- ratio: seconds of the plain path over seconds of the kernel's at equal work: from weights and pose, and from the
-  latent code (with the hypernetwork and its gradient, which is JAX's in both).
-- schedule: seconds that the paper's 100 x 100 leapfrog steps of so many chains take at that speed, by arithmetic.
-- exponent: of the time's growth with particles and with rays, fitted over a factor of 16 and of 8; 1 is linear.
+- ratio: seconds of the plain path over the kernel's at equal work: from weights and pose, and from the latent code
+  (with the hypernetwork and its gradient, which is JAX's in both).
+- schedule: seconds that the paper's 100 x 100 leapfrog steps of eight chains take at that speed, by arithmetic.
+- exponent: growth of the time with particles and with rays, fitted over a factor of 16 and of 8; 1 is linear.
 """
 
 import math
@@ -151,7 +151,7 @@ def _whole(function: Callable, args: tuple) -> Callable:
 def _measure(condition: str, model: Prior, observation: Observation, particles: int, repeats: int) -> list[Row]:
     likelihood = likelihood_of(InferConfig(), observation)
     t = faces_of_view(observation, likelihood)
-    points, coloured = _told(observation, np.asarray(t))
+    points, coloured = _crossings_needed(observation, np.asarray(t))
     field = model.field
     operations = 6.0 * particles * (points * _density_size(field) + coloured * _colour_size(field))
     layers = encoded_size(field.octaves, 3 + field.radial) + 2 * field.width
@@ -208,13 +208,13 @@ def _measure(condition: str, model: Prior, observation: Observation, particles: 
     return rows
 
 
-def _told(observation: Observation, t: np.ndarray) -> tuple[int, int]:
+def _crossings_needed(observation: Observation, t: np.ndarray) -> tuple[int, int]:
     """Crossings at which density is needed, and colour."""
     each = (t < FAR).sum(axis=1)
     first = np.arange(len(each)) < observation.colour_count
     is_object = first & (np.asarray(observation.status) == OBJECT)
-    told = is_object | (np.asarray(observation.limit) > 0)
-    return int(each[told].sum()), int(each[is_object & np.asarray(observation.rgb_valid)].sum())
+    telling = is_object | (np.asarray(observation.limit) > 0)
+    return int(each[telling].sum()), int(each[is_object & np.asarray(observation.rgb_valid)].sum())
 
 
 def _density_size(field: MLPField) -> int:

@@ -1,16 +1,15 @@
-"""Is the next view that Farside suggests worth more than another: unseen space after a second picture, by who chose.
+"""Whether the suggested next view is worth more than another: unseen space after a second picture.
 
-Objects of the test seeds from one random view each, as `farside bench calibration` takes them; the camera's place is
-known. After the first answer a second picture is taken from one of 36 places around the object at the same distance
-(`perception.answers.next_view.ring_of_views`):
+Objects of the test seeds from one random view each, as in `farside bench calibration`. The camera's place is known.
+After the first answer, a second picture is taken from one of 36 places around the object at the same distance
+(`ring_of_views`):
 
-- suggested: the place of the largest expected information gain
+- suggested: the place with the largest expected information gain
 - random: any of them
 - farthest: the place whose direction is farthest from the first camera's
 
-and the answer goes on from both pictures, as `farside live` does. hidden_nll: over the voxels that the first picture
-did not see, by the true geometry, smoothed as everywhere. Results are appended to a file, object by object, and what is
-there is not made again.
+The answer goes on from both pictures, as `farside live` does. hidden_nll is over the voxels that the first picture did
+not see, by the true geometry, with the usual smoothing.
 """
 
 from dataclasses import asdict, dataclass, replace

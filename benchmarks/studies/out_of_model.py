@@ -1,20 +1,18 @@
-"""Objects that the prior does not know: does the answer say so, and is it careful?
+"""Objects that the prior does not know: whether the answer is flagged, and what it says of the space behind them.
 
-Three conditions, through the whole path from RGB-D frame to hypotheses: objects of the family as they come (test seeds,
-a random camera); meshes of others (`*.obj` under `meshes`, the largest side drawn from 10 to 20 cm, on their own up);
-and noise, objects of the family whose depths are all drawn anew. A predictive check, the share of telling pixels that
-the shapes explain, raises `out_of_model` below a bound that was set on validation objects; the evidence per telling
-pixel is shown beside it.
+Three conditions, over the whole path from RGB-D frame to hypotheses: objects of the family (test seeds, a random
+camera); meshes of other sources (`*.obj` under `meshes`, the largest side drawn from 10 to 20 cm, standing on their
+own base); and noise, objects of the family whose depths are all drawn anew. A predictive check, the share of
+informative pixels that the shapes explain, raises `out_of_model` below a bound that was set on validation objects. The
+evidence per informative pixel is shown beside it.
 
-- detected_at_5: share of the strangers that a check finds at a bound that 5% of the family's objects fail; auc: the
-  chance that it puts a random stranger below a random object of the family. From these objects themselves, which the
-  shipped bound does not know.
+- detected_at_5: share of the strangers below a bound that 5% of the family's objects fail. auc: the probability that a
+  check is lower for a random stranger than for a random object of the family. Both use these objects themselves, which
+  the shipped bound does not.
 - flagged: share with `out_of_model`.
-- falsely_free: of random unseen boxes with p_free > 0.95, the share that is truly occupied; of the hypotheses alone,
-  and as a query answers (caution where flagged). free: the share of all boxes that is called so.
-- hidden_nll: as `farside bench hidden`, of the answer as a query gives it.
-
-Answers are appended to a file as they come, and what is there is not made again.
+- falsely_free: of random unseen boxes with p_free > 0.95, the share that is truly occupied, for the hypotheses alone
+  and as a query answers (with caution where flagged). free: the share of all boxes that is called free.
+- hidden_nll: as in `farside bench hidden`, of the answer as a query gives it.
 """
 
 import json
@@ -126,11 +124,11 @@ def _answered(
     if not scored.any():
         raise ValueError("nothing unseen")
     observation = found.observation
-    told = int(np.sum((np.asarray(observation.status) != UNKNOWN) | (np.asarray(observation.limit) > 0)))
+    pixels = int(np.sum((np.asarray(observation.status) != UNKNOWN) | (np.asarray(observation.limit) > 0)))
     boxes = random_boxes(scored, BOXES, np.random.default_rng([seed, view.seed, 31]))
     given = {"alone": Answer(coarsen(h.solid, GRID), h.weights, found.seconds), "queried": as_queried(h, found.seconds)}
     judged = {k: score(view, a, rate, boxes, np.random.default_rng(0)) for k, a in given.items()}
-    evidence = h.diagnostics["log_evidence"] / max(told, 1)
+    evidence = h.diagnostics["log_evidence"] / max(pixels, 1)
     return {
         "explained": round(h.diagnostics["explained"], 4),
         "evidence": round(evidence, 4) if np.isfinite(evidence) else -1e9,
@@ -188,7 +186,8 @@ def _tables(of: Figures) -> list[Table]:
         called = []
         for k in ("alone", "queried"):
             wrong, free = of(c, METHOD, f"falsely_free_{k}"), of(c, METHOD, f"free_{k}")
-            called.append(f"{wrong:.2f} ({free:.1%})" if free else "none is called free")
+            count = round(free * BOXES * of.count(c, METHOD, "flagged"))
+            called.append(f"{wrong:.2f} of {count} ({free:.1%})" if count else "none is called free")
         wrong = of(c, METHOD, "falsely_free_queried")
         boxes.append([named, called[0], gated(called[1], 0.0 if np.isnan(wrong) else wrong, most=0.05)])
     checks = [f"found at 5% false alarms by the {title} (area under the curve)" for title in CHECKS.values()]

@@ -2,13 +2,13 @@
 
 Each object of the first test seeds is seen without occlusion from four sides, evenly spread in azimuth, 15 to 60
 degrees above the table (64 x 64 pixels: colour, range, mask). z~ starts at the encoder's mean of the same views and
-climbs the joint pixel likelihood plus log prior for 300 Adam steps. Every step draws `rays` fresh pixels (55% object,
-25% near its outline, 20% elsewhere) and counts them as `counted` independent ones. Judged on four views from between:
+climbs the joint pixel likelihood plus log prior for 300 Adam steps. Each step draws 256 new pixels (55% object, 25%
+near its outline, 20% elsewhere) and counts them as 1024 independent ones. Four views from between are judged:
 
 - psnr: in the bounding rectangle of the true mask, on white, mean over the four views, rendered through faces twice as
-  dense as the fit's; the gate is the mean over plain and banded objects. Labelled and printed ones are reported.
-- iou: solid occupancy, truth and reconstruction through the same operator on 64^3 voxels; and of both at 32^3.
-- handle_recalled: share of the objects with a handle in which at least half of the true handle's voxels (those that
+  dense as in the fit. The gate is the mean over plain and banded objects. Labelled and printed ones are reported.
+- iou: solid occupancy on 64^3 voxels, truth and reconstruction by the same operator; iou_32: both on 32^3 voxels.
+- handle_recalled: share of the objects with a handle of which at least half of the true handle's voxels (those that
   meet the handle outside the body, 64^3) are solid in the reconstruction.
 """
 

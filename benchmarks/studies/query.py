@@ -1,18 +1,18 @@
-"""Queries: is a box free, by whole shapes jointly and by independent voxels; and how long 100,000 points take.
+"""Queries: is a box free, by whole shapes jointly and by independent voxels; and the time of 100,000 points.
 
-Objects of the test seeds from one random view each, as `farside bench calibration` takes them. Of random boxes in
-unseen space (2 to 10 voxels a side about a voxel that may be occupied; what was seen in them does not count) it is
-asked whether all of it is free. Three ways to answer from the same hypotheses:
+Objects of the test seeds from one random view each, as in `farside bench calibration`. The question is whether a
+random box in unseen space (2 to 10 voxels a side about a voxel that may be occupied; its seen part does not count) is
+all free. Three ways to answer it from the same hypotheses:
 
-- joint: the share of hypotheses in which it is (without the caution that a query adds where an object is out of model)
+- joint: the share of hypotheses in which it is free (without the caution that a query adds for `out_of_model`)
 - independent voxels: the product of (1 - p_occupied) over its voxels
-- each voxel alone: free where p_occupied is below 0.5 in every voxel, as a map that keeps one number a voxel is read
+- each voxel alone: free if p_occupied is below 0.5 in every voxel, as a map with one number per voxel is read
 
-brier: mean squared error of that probability; log_score: nats, probabilities kept within 0.005 of 0 and 1; called
-free: of boxes said to be free with 0.95, the share that is not. Intervals are over objects.
+brier: mean squared error of that probability. log_score: nats, probabilities kept within 0.005 of 0 and 1. called
+free: of boxes with a probability of 0.95 or more, the share that is not free. Intervals are over objects.
 
-Times: the median of 21 for one object, boxes and points in the camera frame; points_alone is the look-up of
-p_occupied by itself, without the joint answer.
+Times: the median of 21 for one object, boxes and points in the camera frame. points_alone is the look-up of p_occupied
+without the joint answer.
 """
 
 import time
@@ -66,15 +66,15 @@ def judged(
 ) -> tuple[dict[str, Float[np.ndarray, "boxes"]], Bool[np.ndarray, "boxes"]]:
     """p_free of every box by way, and whether it is truly free."""
     shapes = coarsen(h.solid, GRID)
-    said: dict[str, list[float]] = {way: [] for way in WAYS}
+    p_free: dict[str, list[float]] = {way: [] for way in WAYS}
     free = []
     for (x, y, z), (a, b, c) in random_boxes(scored_voxels(view.seen, rate), BOXES, rng):
         inside = np.zeros((GRID,) * 3, bool)
         inside[x:a, y:b, z:c] = ~view.seen[x:a, y:b, z:c]
         for way, p in p_free_by_way(shapes.reshape(len(shapes), -1), h.weights, inside.ravel()).items():
-            said[way].append(p)
+            p_free[way].append(p)
         free.append(not (view.solid & inside).any())
-    return {way: np.array(p) for way, p in said.items()}, np.array(free)
+    return {way: np.array(p) for way, p in p_free.items()}, np.array(free)
 
 
 def scores(p: Float[np.ndarray, "boxes"], free: Bool[np.ndarray, "boxes"]) -> dict[str, float]:
@@ -112,7 +112,7 @@ def main(options: Options) -> Summary:
         say(f"{len(every)}, object {number}: brier " + ", ".join(f"{way} {v:.3f}" for way, v in found.items()))
     assert h is not None
     rows, cells = [], []
-    by = {way: [scores(said[way], free) for said, free in every] for way in WAYS}
+    by = {way: [scores(p_free[way], free) for p_free, free in every] for way in WAYS}
     for way, own in by.items():
         column = {metric: np.array([s[metric] for s in own]) for metric in own[0]}
         for metric in ("brier", "log_score"):
@@ -152,14 +152,14 @@ def _times(h: Hypotheses) -> list[Row]:
     T[:, :3, 3] = points[:16]
     swept = Swept(T, np.full((16, 3), 0.05))
     p_occupied = marginal(h)
-    asked: dict[str, Callable[[], object]] = {
+    questions: dict[str, Callable[[], object]] = {
         f"{POINTS:,} points": lambda: query([h], Points(points), "camera"),
         f"{POINTS:,} points_alone": lambda: p_occupied[h.voxels("camera", *points.T)],
         "a box, an eighth of the cube": lambda: query([h], box, "camera"),
         "16 swept boxes": lambda: query([h], swept, "camera"),
     }
     rows = []
-    for name, ask in asked.items():
+    for name, ask in questions.items():
         ask()
         taken = []
         for _ in range(21):
@@ -180,7 +180,7 @@ def _draw(every: list[tuple[dict[str, np.ndarray], np.ndarray]]) -> Figure:
     left.plot([0, 1], [0, 1], "k--", linewidth=1)
     edges = np.linspace(0, 1, 11)
     for way in (JOINT, INDEPENDENT):
-        p = np.concatenate([said[way] for said, _ in every])
+        p = np.concatenate([p_free[way] for p_free, _ in every])
         bins = np.minimum((p * 10).astype(int), 9)
         count = np.bincount(bins, minlength=10)
         shown = count > 20

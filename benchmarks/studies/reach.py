@@ -1,17 +1,17 @@
 """A reaching planner in thousands of simulated scenes: collisions against detours, by what it believes of unseen space.
 
-Objects of the test seeds from one random view each, as `farside bench calibration` takes them. A scene is an object and
-a goal 1.5 to 5 cm beside its true surface, at a random azimuth and height, to which some way in is truly free
-(`examples/reaches.py`: 24 directions, shortest first). Four beliefs choose:
+Objects of the test seeds from one random view each, as in `farside bench calibration`. A scene is an object and a goal
+1.5 to 5 cm beside its true surface, at a random azimuth and height, that can be reached on some truly free path (the
+planner of `examples/reaches.py`: 24 directions, shortest first). Four beliefs choose the path:
 
 - farside: the joint probability over hypotheses that the swept box is free
 - independent voxels: the product of (1 - p_occupied) of the same hypotheses over the box's voxels
 - unknown is free: only voxels that hold a measured point are occupied
-- unknown is occupied: those, and all that no ray passed through
+- unknown is occupied: those, and all voxels that no ray passed through
 
-All voxels are those of 32^3 in the object's cube. collided: share of scenes whose chosen way truly meets the object;
-no_way: share in which none was free enough; detour: how much longer the way is than the shortest that is truly free, m,
-over the scenes in which every belief found a way that did not collide.
+All voxels are those of 32^3 in the object's cube. collided: share of scenes whose chosen path truly meets the object.
+no_way: share in which no path was free enough. detour: how much longer the path is than the shortest truly free one,
+m, over the scenes in which every belief found a path without collision.
 """
 
 from collections.abc import Callable, Iterator
@@ -130,8 +130,8 @@ class Task:
 
     def outcome(self, belief: str, least: float) -> tuple[float, float, float]:
         """(collided, found no way, detour in metres or NaN)."""
-        said = self.p_free[belief]
-        taken = choose(range(len(said)), lambda way: float(said[way]), least)
+        p_free = self.p_free[belief]
+        taken = choose(range(len(p_free)), lambda way: float(p_free[way]), least)
         if taken is None:
             return 0.0, 1.0, np.nan
         hit = not self.free[taken]
@@ -152,8 +152,8 @@ def tasks_of(belief: Belief, count: int, rng: np.random.Generator) -> list[Task]
         masks = [belief.swept(way) for way in ways]
         free = np.array([not belief.truth[mask].any() for mask in masks])
         if free.any():
-            said = [belief.p_free(mask) for mask in masks]
-            by = {b: np.array([s[b] for s in said]) for b in BELIEFS}
+            p_free = [belief.p_free(mask) for mask in masks]
+            by = {b: np.array([p[b] for p in p_free]) for b in BELIEFS}
             found.append(Task(np.array([way.length for way in ways]), free, by))
     return found
 
@@ -179,10 +179,10 @@ def main(options: Options) -> Summary:
         h = estimate(view.frame, view.segment, loaded, seed=seed, stages=240).hypotheses
         refuse_cut(h.result)
         by_object.append(tasks_of(belief_of(view, h), each, np.random.default_rng([seed, number, 53])))
-        said = {b: np.mean([t.outcome(b, LEAST)[0] for t in by_object[-1]] or [0.0]) for b in BELIEFS}
+        collided = {b: np.mean([t.outcome(b, LEAST)[0] for t in by_object[-1]] or [0.0]) for b in BELIEFS}
         say(
             f"{len(by_object)}, object {number}, {len(by_object[-1])} scenes: collided "
-            + ", ".join(f"{b} {v:.2f}" for b, v in said.items())
+            + ", ".join(f"{b} {v:.2f}" for b, v in collided.items())
         )
     rows, lines = [], []
     scenes = sum(map(len, by_object))

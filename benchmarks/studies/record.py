@@ -1,10 +1,10 @@
-"""Recording: frames per second that the recorder sustains with each encoding, and what a frame takes.
+"""Recording: frames per second that the recorder sustains with each encoding, and the cost of a frame.
 
-Frames of the shipped recording (640x480, depth in whole millimetres) with a camera's noise added to the colour, for
-without noise everything compresses too well. They are handed over as fast as the recorder takes them.
+Frames of the shipped recording (640x480, depth in whole millimetres), with a camera's noise added to the colour
+because colour without noise compresses too well. The recorder gets them as fast as it takes them.
 
 - frames_per_s: until the last frame is on its way to the disk, one thread encoding and writing.
-- cpu_ms_per_frame: processor time of the whole process; 30 per s at 10 ms take 30% of one core.
+- cpu_ms_per_frame: processor time of the whole process; 30 frames per second at 10 ms take 30% of one core.
 - bytes_per_frame: of the file.
 """
 

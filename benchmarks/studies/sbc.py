@@ -1,23 +1,22 @@
-"""Simulation-based calibration: does the sampler hand back the posterior of its own model?
+"""Simulation-based calibration: whether the sampler returns the posterior of its own model.
 
 A position is drawn from the prior N(0, I), pixels from the density that the likelihood evaluates (`draw_pixels`), and
 the sampler answers. Over many such draws the rank of the truth among the posterior's weighted samples is uniform for
-any statistic (Talts et al. 2018); volumes have atoms, so ranks are randomised. Nothing of the world enters, no sensor
-and no shape that the prior does not know: what is wrong here is the sampler's, and what is wrong only elsewhere
-(`farside bench hidden`) is the model's. Statistics, each of the shape on 24^3 voxels:
+any statistic (Talts et al. 2018). Volumes have atoms, so ranks are randomised. No sensor and no foreign shape enters:
+an error here is the sampler's, and an error only elsewhere (`farside bench hidden`) is the model's. Statistics, each
+of the shape on 24^3 voxels:
 
-- volume: of the whole shape; hidden: of its half away from the camera; voxel: whether one random far voxel is solid
-- yaw (where the pose is unknown); delta: mean square of the weights' perturbation, where that is sampled, of which a
-  picture tells next to nothing; log_likelihood of the pixels
+- volume: of the whole shape. hidden: of its half away from the camera. voxel: whether one random far voxel is solid.
+- yaw: where the pose is unknown.
+- delta: mean square of the weights' perturbation where it is sampled; a picture says almost nothing about it.
+- log_likelihood: of the pixels.
 
-The tiny field is a ProbNeRF with the weights that it begins training with: shapes like clouds, and few enough weights
-for 200 draws with delta. The quick sampler is what ships, but that all of its particles start from the prior, as no
-picture is drawn that the encoder could read, and that there is one run.
+`cylinder` is an analytic field. The tiny field is a ProbNeRF with the weights that training begins with: shapes like
+clouds, and few enough weights for 200 draws with delta. The quick sampler is the shipped one, but all of its particles
+start from the prior, because no picture is drawn for the encoder, and it makes one run.
 
-outside: how far the ranks' distribution function leaves the band that 95% of uniform samples stay in as a whole
-(`metrics.uniform_band`), 0 where it stays inside. coverage90: share of truths in the central 90%.
-
-Ranks are appended to a file, draw by draw, and what is there is not made again.
+outside: how far the ranks' distribution function leaves the band that holds 95% of uniform samples as a whole
+(`metrics.uniform_band`); 0 if it stays inside. coverage90: share of truths in the central 90%.
 """
 
 from collections.abc import Callable
@@ -155,9 +154,9 @@ def _value(args, positions):
 
 def identity(condition: Condition, prior: str) -> Line:
     """What makes a draw of this condition the same one, but for its number."""
-    told = {"sampler": asdict(condition.sampler), "infer": asdict(_settings(condition)), "pose": condition.pose}
-    told |= {"pixels": [condition.columns, condition.rows], "grid": GRID, "draws": DRAWS, "widths": POSE_SIGMA}
-    settings = {"digest": digest(told)}
+    description = {"sampler": asdict(condition.sampler), "infer": asdict(_settings(condition)), "pose": condition.pose}
+    description |= {"pixels": [condition.columns, condition.rows], "grid": GRID, "draws": DRAWS, "widths": POSE_SIGMA}
+    settings = {"digest": digest(description)}
     same = {"method": "tempered_smc", "condition": condition.name, "settings": settings, "seed": 0}
     return {"prior": prior if condition.model is _prior else "", **same}
 
@@ -177,20 +176,20 @@ def main(options: Options) -> Summary:
     if options.quick:
         options = replace(options, n=min(options.n, 20))
     names = selected(options.conditions, [c.name for c in CONDITIONS], "condition")
-    asked = [c for c in CONDITIONS if c.name in names]
+    chosen = [c for c in CONDITIONS if c.name in names]
     results = results_of("sbc", options)
-    prior = load_prior(None).hash if any(c.model is _prior for c in asked) else ""
-    wanted = {key({**identity(c, prior), "object": number}) for c in asked for number in range(options.n)}
+    prior = load_prior(None).hash if any(c.model is _prior for c in chosen) else ""
+    wanted = {key({**identity(c, prior), "object": number}) for c in chosen for number in range(options.n)}
     return resumed(
         results,
         options,
-        lambda: _measure(options, asked, prior, results),
+        lambda: _measure(options, chosen, prior, results),
         lambda: summary([line for line in results.lines if key(line) in wanted], options),
     )
 
 
-def _measure(options: Options, asked: list[Condition], prior: str, results: Results) -> None:
-    for condition in asked:
+def _measure(options: Options, chosen: list[Condition], prior: str, results: Results) -> None:
+    for condition in chosen:
         model = None
         for number in range(options.n):
             line: Line = {**identity(condition, prior), "object": number}

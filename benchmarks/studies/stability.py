@@ -1,13 +1,13 @@
-"""Where answers stop meaning what they say: one thing made worse at a time, until the method fails.
+"""Where answers stop being reliable: one thing made worse at a time, until the method fails.
 
-The same views throughout: objects of the test seeds as they come, from a random camera (`farside bench calibration`).
-Sensor and calibration are spoilt by growing amounts, or the model is given too little, and everything else is left as
-it ships. At every amount: hidden_nll of what is truly unseen, over the views that were answered; flagged: share of
-answers that say `out_of_model`, or that perception refuses in words; called_free: how many random unseen boxes are
-given p_free > 0.95; falsely_free: the share of those that is occupied. An exception other than a refusal, or a number
-that is none, counts as broken: there must be none.
+The same views throughout: objects of the test seeds from a random camera, as in `farside bench calibration`. Sensor
+and calibration get faults of growing size, or the model gets less than it needs; everything else stays as shipped. For
+each amount:
 
-Answers are appended to a file as they come, and what is there is not made again.
+- hidden_nll: of what is truly unseen, over the views that were answered.
+- flagged: share of answers with `out_of_model`, or that perception refuses with a message.
+- falsely free: of the random unseen boxes with p_free > 0.95, the share that is occupied, and their number.
+- broken: share of answers that ended with another exception or hold a number that is not finite. It must be 0.
 """
 
 from collections.abc import Sequence
@@ -153,10 +153,10 @@ def summary(lines: list[Line], options: Options) -> Summary | None:
     seeds = range(options.seed, options.seed + options.seeds)
     views = objects_of([line for line in lines if line["condition"] == SHIPS])[: options.n]
     by = {(line["condition"], line["object"], line["seed"]): _seen(line) for line in lines}
-    asked = [(view, seed) for seed in seeds for view in views]
+    pairs = [(view, seed) for seed in seeds for view in views]
     found: dict[str, list[list[Seen]]] = {}  # of each amount, seed by seed
     for axis in options.chosen:
-        keys = [[(_condition(axis, amount), *each) for each in asked] for amount in axis.amounts]
+        keys = [[(_condition(axis, amount), *each) for each in pairs] for amount in axis.amounts]
         if len(views) == options.n and all(k in by for amount in keys for k in amount):
             found[axis.name] = [[by[k] for k in amount] for amount in keys]
     if not found:
@@ -227,7 +227,7 @@ def _tables(axes: Sequence[Axis], of: Figures) -> list[Table]:
         "axis", "amount", "hidden_nll, nats", "above as it ships, paired over views", "flagged",
         "occupied, of boxes called free", "between seeds, nats", "broken, gate 0",
     )  # fmt: skip
-    return [Table("One thing made worse", header, lines)]
+    return [Table(f"One thing made worse: {len(axes)} axes", header, lines)]
 
 
 def _draw(axes: Sequence[Axis], found: dict[str, list[list[Seen]]], n: int) -> Figure:

@@ -1,9 +1,8 @@
-"""How long a start takes: from a new process to a node that may open its camera, with an empty compilation cache and
-with a filled one.
+"""Seconds of a start: from a new process to a node that may open its camera, with an empty and a filled cache.
 
-What `farside live` does before its first frame, in a process of its own: imports, the prior, and a rehearsal of what
-inference runs, whose programs are read, or compiled, and not run. What their first run costs besides falls to the first
-object: its first three stages (and their answers) are timed beside those of the same object once more.
+The process does what `farside live` does before its first frame: it imports, loads the prior, and rehearses inference,
+whose programs are read or compiled and not run. Their first run costs the first object more. So its first three stages
+(and their answers) are timed beside those of the same object once more.
 """
 
 import json

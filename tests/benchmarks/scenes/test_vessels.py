@@ -9,7 +9,7 @@ import pytest
 from benchmarks.measures.rebuilt import VIEWS, see
 from benchmarks.measures.scores import Answer, random_boxes, shapes_at
 from benchmarks.rivals.quick import METHODS, POSTERIOR
-from benchmarks.scenes.vessels import GRID, base_rate, hidden_vessel, told_pose, vessel_picture, vessel_view
+from benchmarks.scenes.vessels import GRID, base_rate, hidden_vessel, pose_as_stated, vessel_picture, vessel_view
 from benchmarks.studies.frame import (
     DATA,
     OBJECTS,
@@ -95,16 +95,16 @@ def test_without_depth_what_counts_as_seen_tells_nothing_of_where_the_surface_is
 
 def test_without_depth_the_camera_s_pose_errs_as_much_as_is_stated():
     exact = np.eye(4)
-    told = np.stack([told_pose(exact, seed) for seed in range(500)])
-    tilt = np.degrees(np.arctan2(told[:, 2, 1], told[:, 2, 2]))
+    stated_poses = np.stack([pose_as_stated(exact, seed) for seed in range(500)])
+    tilt = np.degrees(np.arctan2(stated_poses[:, 2, 1], stated_poses[:, 2, 2]))
     stated = PlaneGuess()
-    assert np.std(told[:, 2, 3]) == pytest.approx(stated.height_sigma, rel=0.1)
+    assert np.std(stated_poses[:, 2, 3]) == pytest.approx(stated.height_sigma, rel=0.1)
     assert np.std(tilt) == pytest.approx(stated.tilt_sigma, rel=0.1)
-    assert np.abs([told[:, 2, 3].mean() / stated.height_sigma, tilt.mean() / stated.tilt_sigma]).max() < 0.15
+    assert np.abs([stated_poses[:, 2, 3].mean() / stated.height_sigma, tilt.mean() / stated.tilt_sigma]).max() < 0.15
     picture = vessel_picture(2_000_001, "hidden")
     assert picture is not None
     supposed = vessel_view(picture, depth=False).frame.T_world_camera
-    np.testing.assert_array_equal(supposed, told_pose(picture.T_world_camera, 2_000_001))
+    np.testing.assert_array_equal(supposed, pose_as_stated(picture.T_world_camera, 2_000_001))
     np.testing.assert_array_equal(vessel_view(picture).frame.T_world_camera, picture.T_world_camera)
 
 

@@ -78,9 +78,9 @@ def test_answers_are_kept_and_compared(tmp_path: Path, monkeypatch: pytest.Monke
     assert asked == [(OWN, s) for s in seeds] + [(FROM_PRIOR.name, s) for s in seeds[:2]]
     value = {(r.method, r.metric): (r.value, r.n) for r in rows}
     truth = np.mean([bool(Placed(s, 0.0, 0.0, 0.0).shape.has_handle) for s in seeds])
-    assert value[OWN, "said"] == (0.75, 3) and value[OWN, "true"] == (pytest.approx(truth), 3)
-    assert value[FROM_PRIOR.name, "log_score_above_controller"] == (0.0, 2) and value[PRIOR, "said"][0] == 0.5
-    assert value[OWN, "said where p is 0.6 to 1"] == (0.75, 3) and (OWN, "said where p is 0 to 0.05") not in value
+    assert value[OWN, "p"] == (0.75, 3) and value[OWN, "share"] == (pytest.approx(truth), 3)
+    assert value[FROM_PRIOR.name, "log_score_above_controller"] == (0.0, 2) and value[PRIOR, "p"][0] == 0.5
+    assert value[OWN, "p where p is 0.6 to 1"] == (0.75, 3) and (OWN, "p where p is 0 to 0.05") not in value
     assert value[PRIOR, "log_score_above_controller"][1] == 3 and summary.picture().axes
     assert main(Options(tmp_path, **settings)).rows == rows and len(asked) == 5
     assert main(Options(tmp_path, **settings, only_chart=True)).rows == rows
