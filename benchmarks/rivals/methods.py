@@ -108,7 +108,7 @@ class Method:
     base: str = "smc"  # the method that it differs from by one lever
 
 
-def _weighted(positions: Float[Array, "s d"], weights: Float[np.ndarray, "s"], gradients: float) -> Posterior:
+def weighted_posterior(positions: Float[Array, "s d"], weights: Float[np.ndarray, "s"], gradients: float) -> Posterior:
     """Positions of a method that is no sampler as samples of one population."""
     nan, zero = jnp.asarray(np.float32("nan")), jnp.zeros((), jnp.int32)
     with np.errstate(divide="ignore"):
@@ -132,7 +132,7 @@ def _encoder() -> Method:
 
     def sample(q: Question, _: bool) -> Sampled:
         drawn, weights = encoder_alone(q.key, q.prior.model, q.likelihood, q.observed[0], q.picture, config)
-        return _sampled(q, _weighted(drawn, weights, 0.0), evaluations=config.yaws * config.draws)
+        return _sampled(q, weighted_posterior(drawn, weights, 0.0), evaluations=config.yaws * config.draws)
 
     return Method("encoder alone", "encoder", "encoder", sample, {"yaws": config.yaws, "draws": config.draws})
 
@@ -145,7 +145,9 @@ def _map() -> Method:
         starts = guesses(q.key, q.prior.model, q.picture, config.yaws, q.likelihood.sample_pose)
         best, _ = map_estimate(q.prior.model, q.likelihood, q.observed[0], starts, fit)
         gradients = config.yaws * fit.screen_steps + fit.survivors * fit.steps
-        return _sampled(q, _weighted(best[None], np.ones(1), gradients), evaluations=config.yaws + fit.survivors)
+        return _sampled(
+            q, weighted_posterior(best[None], np.ones(1), gradients), evaluations=config.yaws + fit.survivors
+        )
 
     return Method("map", "map", "MAP", sample, {"yaws": config.yaws, **asdict(fit)})
 
@@ -160,7 +162,7 @@ def _vi(config: VIConfig) -> Method:
         found, _ = mean_field(q.key, log_likelihood, args, starts[at], config)
         count = q.config.hypotheses
         noise = jax.random.normal(jax.random.fold_in(q.key, 1), (count, starts.shape[1]))
-        drawn = _weighted(found.draw(noise), np.full(count, 1.0 / count), config.steps * config.draws)
+        drawn = weighted_posterior(found.draw(noise), np.full(count, 1.0 / count), config.steps * config.draws)
         return _sampled(q, drawn, evaluations=yaws)
 
     return Method("vi", "vi", "VI", sample, {"yaws": yaws, **asdict(config)})

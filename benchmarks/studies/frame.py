@@ -139,12 +139,6 @@ def free_points(
     return points[keep]
 
 
-def weighted_median(values: Float[np.ndarray, "n"], weights: Float[np.ndarray, "n"]) -> float:
-    """The least value that half of the weight does not exceed."""
-    order = np.argsort(values)
-    return float(values[order][np.searchsorted(np.cumsum(weights[order]), 0.5 * np.sum(weights))])
-
-
 def measure(
     h: Hypotheses, frame: Frame, plane: Float[np.ndarray, "4"], truth: dict[int, TrueObject], object_id: int
 ) -> dict[str, float]:
@@ -161,7 +155,7 @@ def measure(
     about = np.where(index >= 0, maximum_filter(h.p_occupied, 3).ravel()[index], 0.0)
     free = free_points(frame, plane, truth, object_id)
     return {
-        "chamfer": 1000.0 * weighted_median(distance, h.weights),
+        "chamfer": 1000.0 * float(np.quantile(distance, 0.5, weights=h.weights, method="inverted_cdf")),
         "p_within_one_voxel": float(about.mean()),
         "p_three_voxels_outside": float(np.mean(_p_occupied(h, outside))),
         "log_score": hidden_log_score(_p_occupied(h, surface[hidden]), _p_occupied(h, free)),

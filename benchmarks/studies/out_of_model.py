@@ -83,8 +83,9 @@ def _measure(options: Options, prior: Prior, results: Results) -> None:
     config = ControllerConfig()
     settings = {"digest": digest(asdict(config), options.quick)}
     common = {"prior": prior.hash, "method": METHOD, "settings": settings, "seed": options.seed}
+    views = list(_views(options.n, options.noise, options.meshes))  # before what takes long: without meshes it raises
     rate = base_rate(128 if options.quick else 1024, config=config.observe)
-    for condition, name, make in _views(options.n, options.noise, options.meshes):
+    for condition, name, make in views:
         line: Line = {**common, "condition": condition, "object": name}
         if line in results:
             continue

@@ -62,6 +62,7 @@ def test_answers_that_are_there_are_not_made_again(tmp_path: Path, monkeypatch: 
         return Seen(0.2 + amount, amount > 0.5, p_free=(0.99, 0.1), occupied=(False, True))
 
     monkeypatch.setattr("benchmarks.studies.stability.look", looked)
+    monkeypatch.setattr("benchmarks.studies.stability.base_rate", lambda _: None)
     settings = {"n": 1, "seeds": 1, "axes": "occluded;flying", "results": tmp_path / "kept.jsonl"}
     first = main(Options(tmp_path, **settings)).rows
     assert len(asked) == 1 + 4 + 3  # as it ships once
@@ -83,6 +84,7 @@ def test_seeds_are_told_apart_from_views(tmp_path: Path, monkeypatch: pytest.Mon
         return Seen(scores.get((seed, amount), 0.2), False, p_free=(0.99,), occupied=(False,))
 
     monkeypatch.setattr("benchmarks.studies.stability.look", looked)
+    monkeypatch.setattr("benchmarks.studies.stability.base_rate", lambda _: None)
     rows = main(Options(tmp_path, n=2, seeds=2, axes="flying", results=tmp_path / "kept.jsonl")).rows
     row = {(r.condition, r.metric): r for r in rows}
     assert row["8", "hidden_nll"].value == pytest.approx(0.4) and row["8", "hidden_nll"].n == 2

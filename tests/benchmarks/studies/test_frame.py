@@ -1,0 +1,36 @@
+"""The real frame's measures: normals, boxes and free points are what they are called."""
+
+import numpy as np
+
+from benchmarks.studies.frame import DATA, OBJECTS, TrueObject, free_points, is_hidden, outward_normals, read_truth
+from perception.observation.segmentation import segment
+from perception.observation.support_plane import heights
+from perception.sources.frame_folder import read_frame_folder
+
+
+def test_normals_of_a_sphere_point_outwards():
+    rng = np.random.default_rng(2)
+    points = rng.standard_normal((2000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    normals = outward_normals(0.05 * points + [0.1, 0.2, 0.7])
+    assert (np.einsum("ni,ni->n", normals, points) > 0.97).mean() > 0.99
+
+
+def test_a_box_turns_with_its_object():
+    T = np.eye(4)
+    T[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    T[:3, 3] = [1.0, 0.0, 0.0]
+    model = TrueObject(np.array([[0.0, 0, 0], [0.3, 0.1, 0.1]]), T)
+    inside = model.box_holds(np.array([[0.95, 0.25, 0.05], [1.25, 0.05, 0.05]]), 0.01)
+    assert inside.tolist() == [True, False]
+
+
+def test_free_points_of_the_real_frame_are_free_and_unseen(shared_data):
+    frame, truth = read_frame_folder(DATA), read_truth(DATA)
+    plane = segment(frame, 1)[0].plane
+    points = free_points(frame, plane, truth, 1)
+    assert len(points) > 500 and set(truth) == set(OBJECTS)
+    assert (heights(points, plane) > 0).all() and is_hidden(frame, points).all()
+    for other in truth.values():
+        assert not other.box_holds(points, 0.0).any()
+        assert np.linalg.norm(points[::50, None] - other.in_camera[None], axis=-1).min() >= 0.015
