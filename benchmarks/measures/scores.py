@@ -188,8 +188,9 @@ def picture_psnr(
     turned = direction @ A[:3, :3].T
     turned /= np.linalg.norm(turned, axis=1, keepdims=True)
     truth = np.asarray(trace(view.shape, (origin @ A[:3, :3].T + A[:3, 3]).astype(np.float32), turned)[2])
-    at = np.searchsorted(np.cumsum(weights), (np.arange(config.hypotheses) + 0.5) / config.hypotheses * weights.sum())
-    chosen = positions[jnp.asarray(np.minimum(at, len(weights) - 1))]
+    levels = (np.arange(config.hypotheses) + 0.5) / config.hypotheses
+    at = np.quantile(np.arange(len(weights)), levels, weights=weights, method="inverted_cdf")
+    chosen = positions[jnp.asarray(at)]
     rays = Rays(jnp.asarray(origin), jnp.asarray(direction))
     made = np.asarray(_rendered(model, likelihood, chosen, pose_sigma, rays, config.lattice), np.float64)
     each = config.size**2

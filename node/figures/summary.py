@@ -15,9 +15,8 @@ def hidden_volume(h: Hypotheses) -> tuple[float, Float[np.ndarray, "3"]]:
     """
     hidden = h.unseen
     solid = h.solid[:, hidden].sum(axis=1) * h.voxel_m**3
-    order = np.argsort(solid)
-    at = np.searchsorted(np.cumsum(h.weights[order]), [0.05, 0.5, 0.95])
-    return float(hidden.sum() * h.voxel_m**3), solid[order][np.minimum(at, len(order) - 1)]
+    quantiles = np.quantile(solid, [0.05, 0.5, 0.95], weights=h.weights, method="inverted_cdf")
+    return float(hidden.sum() * h.voxel_m**3), quantiles
 
 
 def figures(h: Hypotheses) -> dict[str, str]:

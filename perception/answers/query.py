@@ -285,7 +285,5 @@ def _volume_quantiles(objects: list[tuple[Float[np.ndarray, "S"], Float[np.ndarr
 def _quantile(
     values: Float[np.ndarray, "S"], weights: Float[np.ndarray, "S"], levels: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n"]:
-    order = np.argsort(values, kind="stable")
-    cumulative = np.cumsum(weights[order])
-    at = np.searchsorted(cumulative, levels - 1e-9)  # a level met exactly, but for rounding, is met
-    return values[order][np.minimum(at, len(values) - 1)]
+    # a level met exactly, but for rounding, is met
+    return np.quantile(values, levels - 1e-9, weights=weights, method="inverted_cdf")

@@ -173,8 +173,8 @@ def thin(posterior: Posterior, count: int) -> tuple[Int[np.ndarray, "s"], Float[
         members = np.flatnonzero(population == name)
         w = np.exp(log_w[members] - log_w[members].max())
         share = np.exp(log_w[members]).sum()
-        at = np.searchsorted(np.cumsum(w) / w.sum(), (np.arange(each) + 0.5) / each)
-        indices.append(members[np.minimum(at, len(members) - 1)])
+        levels = (np.arange(each) + 0.5) / each
+        indices.append(np.quantile(members, levels, weights=w, method="inverted_cdf"))
         weights.append(np.full(each, share / each))
     w = np.concatenate(weights)
     w = w / w.sum() if w.sum() > 0 else np.full(len(w), 1.0 / len(w))

@@ -153,6 +153,17 @@ def test_error_effective_number_and_age(mug):
     assert query([mug], Box(*BODY), "object").p_free_se == 0.0
 
 
+@pytest.mark.parametrize("weights", [np.full(20, 0.05), np.random.default_rng(3).dirichlet(np.ones(20))])
+def test_a_volume_quantile_is_the_least_volume_that_enough_weight_does_not_exceed(weights):
+    tops = np.random.default_rng(4).permutation(20) // 2  # each volume twice
+    columns = [_fill(((-0.04, -0.04, -0.08), (0.04, 0.04, -0.08 + VOXEL * (top + 1)))) for top in tops]
+    found = query([_object(columns, list(weights))], Box((-0.16,) * 3, (0.16,) * 3), "object").volume_m3
+    volumes = 0.08 * 0.08 * VOXEL * (tops + 1.0)
+    for level, value in zip((0.05, 0.5, 0.95), found.values(), strict=True):
+        enough = [v for v in volumes if weights[volumes <= v].sum() >= level - 1e-9]  # rounding raises no quantile
+        assert value == pytest.approx(min(enough))
+
+
 def test_a_scene_is_joint_over_its_objects(mug):
     # A second mug, its handle towards the first one's: both handles may reach into the gap between them.
     other = _object([_fill(BODY, LEFT), _fill(BODY, RIGHT)], [0.4, 0.6], origin=(0.2, 0.0, 0.5), object_id=2)

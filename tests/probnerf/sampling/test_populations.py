@@ -113,6 +113,19 @@ def test_so_many_samples_stand_for_all_and_every_population_keeps_its_weight(cou
     np.testing.assert_allclose(np.bincount(population, weights=weights), share / share.sum(), rtol=1e-6)
 
 
+@pytest.mark.parametrize("count", [4, 10, 64])
+def test_samples_are_taken_where_the_cumulated_weight_first_reaches_even_levels(count: int) -> None:
+    whole = _run(0)
+    log_w = np.random.default_rng(1).normal(size=len(whole.log_weights)).astype(np.float32)
+    for weights in (log_w, np.zeros_like(log_w)):  # where all weigh the same a level may be met exactly
+        indices, _, population = thin(replace(whole, log_weights=jnp.asarray(weights)), count)
+        for name in np.unique(population):
+            members, kept = np.flatnonzero(np.asarray(whole.population) == name), np.sum(population == name)
+            w = np.exp(weights[members].astype(np.float64) - weights[members].max())
+            at = np.searchsorted(np.cumsum(w) / w.sum(), (np.arange(kept) + 0.5) / kept)
+            np.testing.assert_array_equal(indices[population == name], members[at])
+
+
 def test_what_goes_on_keeps_to_the_populations_that_made_it() -> None:
     """Two runs of two populations are as many as one of four."""
     config = InferConfig(smc=quick_smc(4, 4), smc_from_prior=quick_smc(2, 16))
