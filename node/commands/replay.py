@@ -2,21 +2,23 @@
 
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from calibration.camera import Camera
 from calibration.camera_file import read_camera
 from node.figures.object_figure import draw_object
-from node.figures.summary import figures, warnings
+from node.figures.summary import answer, diagnostics, figures, warnings
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.hypotheses_file import frame_path, hypotheses_path, load, save
+from perception.answers.summary import summarise
 from perception.inference.controller import Estimate, estimate
 from perception.inference.settings import ControllerConfig, TrackConfig
 from perception.observation.segmentation import Segment, segment
@@ -123,9 +125,7 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
             continue
         if not done and not is_source:
             (kept / "meta.json").unlink(missing_ok=True)  # an earlier run's frame is not read beside this one's objects
-        path = publish(config.folder, frame, found, result.hypotheses, result.seconds, out)
-        for line in result.log:
-            out.print(f"  {line}", highlight=False, soft_wrap=True)
+        path = publish(config.folder, frame, found, result.hypotheses, result.seconds, out, result.log)
         if not done:
             _clear_others(config.folder, path, result.hypotheses if config.object is not None else None, out)
             if not is_source:
@@ -204,13 +204,21 @@ def progress_of(
         yield on_stage
 
 
-def publish(folder: Path, frame: Frame, found: Segment, h: Hypotheses, seconds: float, out: Console) -> Path:
-    """Save, picture and print one object; the file's path."""
+def publish(
+    folder: Path,
+    frame: Frame,
+    found: Segment,
+    h: Hypotheses,
+    seconds: float,
+    out: Console,
+    log: Sequence[str] = (),
+) -> Path:
+    """Save, picture and print one object (`report`); the file's path."""
     path = hypotheses_path(folder, h.object_id)
     save(path, h)
     picture = path.with_suffix(".png")
     draw_object(picture, h, frame, found)
-    report(h, out, time=f"{seconds:.1f} s")
+    report(h, out, seconds, log)
     for written in (path, picture):
         out.print(f"  {written}", highlight=False, soft_wrap=True)
     return path
@@ -238,13 +246,20 @@ def _is_of_frame(path: Path, h: Hypotheses) -> bool:
     return (other.stamp_ns, other.frame_id) == (h.stamp_ns, h.frame_id)
 
 
-def report(h: Hypotheses, out: Console, **first: str) -> None:
-    """The short table of one object."""
-    table = Table.grid(padding=(0, 2))
-    for name, value in {**first, **figures(h)}.items():
-        table.add_row(f"  {name}", value)
+def report(h: Hypotheses, out: Console, seconds: float | None = None, log: Sequence[str] = ()) -> None:
+    """One object: the answer in words, its numbers, what to do about doubts, and last the sampler's diagnostics.
+
+    `seconds` is how long inference took, `log` why it used as much model as it did.
+    """
     label = f" ({h.label})" if h.label else ""
-    out.print(f"object {h.object_id}{label}", style="bold", highlight=False)
+    out.print(f"[bold]object {h.object_id}{escape(label)}:[/] {answer(summarise(h))}", highlight=False, soft_wrap=True)
+    table = Table.grid(padding=(0, 2))
+    for name, value in figures(h).items():
+        table.add_row(f"  {name}", value)
     out.print(table, highlight=False)
     for line in warnings(h):
         out.print(f"  {line}", style="yellow", highlight=False, soft_wrap=True)
+    time = {} if seconds is None else {"time": f"{seconds:.1f} s"}
+    details = ", ".join(f"{name} {value}" for name, value in {**time, **diagnostics(h)}.items())
+    for line in (f"sampler: {details}", *log):
+        out.print(f"  {line}", style="dim", highlight=False, soft_wrap=True)

@@ -13,13 +13,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from node.figures import voxel_renderer
-from node.figures.summary import figures, warnings
+from node.figures.summary import answer, diagnostics, figures, warnings
 from perception.answers.hypotheses import Hypotheses
+from perception.answers.summary import summarise
 from perception.observation.segmentation import Segment
 from perception.sources.frame import Frame
 from probnerf.types import BASE_Z, UNKNOWN
 
 SHOWN = 4  # hypotheses in a picture
+_ROWS = 6  # of the summary
 _PIXELS = 180  # of a small picture's side
 _LOG2 = float(np.log(2.0))
 _CURVES = {"loss": "loss (nats per object)", "fit": "fit (nats per object)", "kl": "KL (nats)"}
@@ -186,11 +188,14 @@ def _add_bar(figure: Figure, colours: str | Colormap, top: float, axes: list[Axe
 
 
 def _write_summary(ax: Axes, h: Hypotheses) -> None:
-    for i, (name, value) in enumerate(figures(h).items()):
-        ax.text(0.03, 0.95 - 0.08 * i, name, fontsize=9, color="#666666", transform=ax.transAxes)
-        ax.text(0.36, 0.95 - 0.08 * i, value, fontsize=9, transform=ax.transAxes)
-    doubts = "\n".join(textwrap.fill(line, 44) for line in warnings(h))
-    ax.text(0.03, 0.41, doubts, va="top", fontsize=9, color="#b03020", transform=ax.transAxes)
+    text = [textwrap.fill(part, 46) for part in answer(summarise(h)).split("; ")]
+    ax.text(0.03, 0.97, "\n".join(text), va="top", fontsize=9, transform=ax.transAxes)
+    rows = {**figures(h), **diagnostics(h)}
+    for i, (name, value) in enumerate(list(rows.items())[:_ROWS]):
+        ax.text(0.03, 0.68 - 0.065 * i, name, fontsize=8, color="#666666", transform=ax.transAxes)
+        ax.text(0.36, 0.68 - 0.065 * i, value, fontsize=8, transform=ax.transAxes)
+    doubts = "\n".join(textwrap.fill(line, 50) for line in warnings(h))
+    ax.text(0.03, 0.29, doubts, va="top", fontsize=8, color="#b03020", transform=ax.transAxes)
     unseen = (
         "surface not measured, or out of its sight" if h.object_frame.sight_sigma > 0 else "surface out of its sight"
     )

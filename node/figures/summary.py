@@ -1,12 +1,12 @@
-"""What is said of an object in a few numbers: the same in `replay`'s table, in `view` and under the picture."""
+"""An object's answer in words, its numbers, and the sampler's diagnostics: for `replay`, `view` and the picture."""
 
 import numpy as np
 from jaxtyping import Float
 
 from perception.answers.hypotheses import Hypotheses
+from perception.answers.summary import MARGIN_M, Direction, Summary
 
 CM3 = 1e6  # per cubic metre
-R_HAT = 1.1  # above it chains have not mixed (Gelman et al., BDA3, section 11.4)
 
 
 def hidden_volume(h: Hypotheses) -> tuple[float, Float[np.ndarray, "3"]]:
@@ -19,19 +19,47 @@ def hidden_volume(h: Hypotheses) -> tuple[float, Float[np.ndarray, "3"]]:
     return float(hidden.sum() * h.voxel_m**3), quantiles
 
 
+def answer(s: Summary) -> str:
+    """What a robot's user acts on, in one line: size, chance of a hidden part, next view."""
+    width, depth, height = 100.0 * s.size_m
+    chance = f"{s.p_sticks_out:.0%}" if s.p_sticks_out >= s.p_least else f"less than {s.p_least:.0%}"
+    return (
+        f"about {width:.0f} × {depth:.0f} × {height:.0f} cm (width, depth, height); {chance} chance that an unseen "
+        f"part reaches more than {100.0 * MARGIN_M:.0f} cm beyond what was seen; {_advice(s.next_view)}"
+    )
+
+
+def _advice(view: Direction | None) -> str:
+    if view is None:
+        return "another view would tell little"
+    places = {"front": "the front", "left": "the left", "back": "behind", "right": "the right"}
+    above = {"front": "above", "left": "above on the left", "back": "above and behind", "right": "above on the right"}
+    return f"look next from {(above if view.above else places)[view.side]}"
+
+
 def figures(h: Hypotheses) -> dict[str, str]:
-    """Short names and values with units, in the order of reading."""
+    """The answer's numbers with units, in the order of reading."""
     space, (low, middle, high) = hidden_volume(h)
-    d = h.diagnostics
-    evidence, error = d.get("log_evidence", np.nan), d.get("log_evidence_se", np.nan)
     return {
-        "hypotheses": f"{len(h.weights)} ({h.effective_hypotheses:.1f} effective)",
-        "ESS": _number(d.get("ess", np.nan), ".0f"),
-        "log evidence": f"{evidence:.1f} ± {_number(error, '.1f')} nats" if np.isfinite(evidence) else "none",
         "unseen space": f"{CM3 * space:.0f} cm³",
         "solid in it": f"{CM3 * middle:.0f} cm³ ({CM3 * low:.0f} to {CM3 * high:.0f})",
-        "acceptance": _number(d.get("acceptance", np.nan), ".2f"),
+        "hypotheses": f"{len(h.weights)} ({h.effective_hypotheses:.1f} effective)",
+    }
+
+
+def diagnostics(h: Hypotheses) -> dict[str, str]:
+    """Numbers about the sampler, for those who tune it."""
+    d = h.diagnostics
+    evidence, error = d.get("log_evidence", np.nan), d.get("log_evidence_se", np.nan)
+    populations = len(np.unique(h.population)) + h.failed
+    return {
         "stopped": f"{h.result}, stage {h.stage}",
+        "ESS": _number(d.get("ess", np.nan), ".0f"),
+        "log evidence": f"{evidence:.1f} ± {_number(error, '.1f')} nats" if np.isfinite(evidence) else "none",
+        "acceptance": _number(d.get("acceptance", np.nan), ".2f"),
+        "R-hat": _number(d.get("r_hat", np.nan), ".2f"),
+        "divergences": _number(d.get("divergences", np.nan), ".0f"),
+        "failed populations": f"{h.failed} of {populations}",
     }
 
 
@@ -43,25 +71,27 @@ def unexplained(h: Hypotheses) -> str:
 
 
 def warnings(h: Hypotheses) -> list[str]:
-    """What makes the answer doubtful, if anything."""
-    out = []
+    """What makes the answer doubtful, and what to do about it."""
+    lines = []
     if h.out_of_model:
-        out.append(f"{unexplained(h)}; its answers are cautious")
-    if (share := h.object_frame.sight_sigma) > 0.0:
-        out.append(f"no depth: distance and size are known to {100 * share:.1f}% by the camera's height and tilt alone")
-    if not h.inside_view:
-        out.append("the picture's border cuts the object off")
-    if (r_hat := h.diagnostics.get("r_hat", np.nan)) > R_HAT:
-        out.append(f"the sampler's populations disagree (R-hat {r_hat:.2f}): other shapes may fit too")
-    left = len(np.unique(h.population))
-    if h.failed >= left:
-        unknown = ": how far off it may be is not known" if h.alone else ""
-        out.append(
-            f"the answer rests on {left} of the sampler's {h.failed + left} populations; the others failed{unknown}"
+        lines.append(f"{unexplained(h)}; queries answer with caution")
+    elif h.result == "budget":
+        lines.append(
+            "the time was up before the sampler converged: the answer is less certain than it can be; raise the budget"
         )
-    if h.diagnostics.get("divergences", 0.0) > 0:
-        out.append(f"{h.diagnostics['divergences']:.0f} divergent trajectories")
-    return out
+    if (share := h.object_frame.sight_sigma) > 0.0:
+        lines.append(
+            f"no depth: distance and size are known to {100 * share:.1f}%, from the camera's height and tilt alone; "
+            "measure these well, or use a depth camera"
+        )
+    if not h.inside_view:
+        lines.append("the picture's border cuts the object off: move the camera until all of it is in the picture")
+    if h.alone:
+        lines.append(
+            f"the answer rests on one of {h.failed + 1} populations, the others failed: its error is not known, and "
+            'queries answer "unsure"; take another view, or repeat with another seed'
+        )
+    return lines
 
 
 def _number(value: float, form: str) -> str:

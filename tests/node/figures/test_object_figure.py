@@ -9,8 +9,9 @@ import pytest
 
 from node.figures import voxel_renderer
 from node.figures.object_figure import draw_object, draw_training, representatives
-from node.figures.summary import figures, hidden_volume, warnings
+from node.figures.summary import answer, diagnostics, figures, hidden_volume, warnings
 from perception.answers.hypotheses import Hypotheses
+from perception.answers.summary import Direction, Summary
 from perception.observation.object_frame import ObjectFrame
 from perception.observation.segmentation import segment
 from perception.sources.frame import Frame
@@ -117,21 +118,34 @@ def test_the_short_table_tells_the_unseen(mug: Hypotheses) -> None:
     hidden = ~mug.seen & (voxel_centres(GRID)[..., 2] > -0.75)
     assert space == pytest.approx(hidden.sum() * mug.voxel_m**3)
     assert 0 < low <= middle <= high < space
-    rows = figures(mug)
+    rows = {**figures(mug), **diagnostics(mug)}
     assert rows["log evidence"] == "-321.5 ± 0.5 nats" and rows["stopped"] == "converged, stage 7"
     assert rows["hypotheses"].startswith("4 (2.7") and "cm³" in rows["solid in it"]
-    assert figures(replace(mug, diagnostics={"log_evidence": float("nan")}))["log evidence"] == "none"
+    assert diagnostics(replace(mug, diagnostics={"log_evidence": float("nan")}))["log evidence"] == "none"
+
+
+def test_warnings_are_about_what_the_user_can_change(mug: Hypotheses) -> None:
     assert not warnings(mug)
-    bad = {"divergences": 2.0, "r_hat": 1.3}
-    assert len(warnings(replace(mug, out_of_model=True, inside_view=False, diagnostics=bad))) == 4
-    assert not warnings(replace(mug, diagnostics={"r_hat": 1.05}))
+    assert not warnings(replace(mug, diagnostics={"divergences": 2.0, "r_hat": 1.3}))  # numbers, not doubts
+    assert len(warnings(replace(mug, out_of_model=True, inside_view=False))) == 2
     lost = {"failed_populations": 3.0}
-    (said,) = warnings(replace(mug, population=np.zeros_like(mug.population), diagnostics=lost))
-    assert said.startswith("the answer rests on 1 of the sampler's 4 populations") and "not known" in said
-    two = replace(mug, population=np.arange(len(mug.weights)) % 2, diagnostics=lost)
-    assert len(warnings(two)) == 1 and "not known" not in warnings(two)[0]
-    assert not warnings(replace(two, diagnostics={"failed_populations": 1.0}))
-    (said,) = warnings(replace(mug, out_of_model=True))
-    assert said.startswith("out of model: no shape of the prior")
-    (said,) = warnings(replace(mug, out_of_model=True, result="budget"))  # time may be all that it lacked
-    assert "cut short (budget); give it more time" in said and "out of model" not in said
+    (line,) = warnings(replace(mug, population=np.zeros_like(mug.population), diagnostics=lost))
+    assert line.startswith("the answer rests on one of 4 populations") and "take another view" in line
+    assert not warnings(replace(mug, population=np.arange(len(mug.weights)) % 2, diagnostics=lost))
+    (line,) = warnings(replace(mug, result="budget"))
+    assert line.startswith("the time was up") and "raise the budget" in line
+    (line,) = warnings(replace(mug, out_of_model=True))
+    assert line.startswith("out of model: no shape of the prior")
+    (line,) = warnings(replace(mug, out_of_model=True, result="budget"))  # time may be all that it lacked
+    assert "cut short (budget); give it more time" in line and "out of model" not in line
+
+
+def test_the_answer_is_a_sentence_to_act_on() -> None:
+    summary = Summary(np.array([0.087, 0.09, 0.098]), 0.31, 0.05, 0.02, Direction("left", False, 0.4))
+    assert answer(summary) == (
+        "about 9 × 9 × 10 cm (width, depth, height); 31% chance that an unseen part reaches more than 1 cm beyond what "
+        "was seen; look next from the left"
+    )
+    assert "; less than 2% chance" in answer(replace(summary, p_sticks_out=0.0))
+    assert answer(replace(summary, next_view=Direction("back", True, 0.4))).endswith("from above and behind")
+    assert answer(replace(summary, next_view=None)).endswith("another view would tell little")
