@@ -100,6 +100,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "tyro": ("node/__main__.py", "node/options.py", "benchmarks/*", "examples/*"),
     "trimesh": ("perception/answers/regions.py", "benchmarks/scenes/meshes.py"),
     "rich": ("node/*", "benchmarks/*"),
+    "PIL": ("node/figures/turning.py",),  # GIF
     "matplotlib": ("node/figures/*", "benchmarks/*"),
 }
 

@@ -8,6 +8,7 @@ from rich.console import Console
 
 from node.commands.replay import report
 from node.figures.object_figure import draw_object
+from node.figures.turning import draw_turning
 from node.viewer.scene3d import CameraView, camera_view
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.hypotheses_file import frame_path, load_scene
@@ -36,7 +37,9 @@ def open_page(path: Path, port: int, token: bool, out: Console, err: Console) ->
 
 def draw(path: Path, picture: Path, out: Console, err: Console) -> None:
     """Describe each object of a hypotheses file or folder and draw its picture: to `picture`, or with several objects
-    to `object_<id>.png` in the folder `picture`. Raises FileNotFoundError or ValueError in one line.
+    to `object_<id>.png` in the folder `picture`. A name that ends in .gif gets turning hypotheses (`draw_turning`).
+
+    Raises FileNotFoundError or ValueError in one line.
     """
     scene = load_scene(path)
     several = len(scene) > 1
@@ -44,13 +47,17 @@ def draw(path: Path, picture: Path, out: Console, err: Console) -> None:
         raise ValueError(f"{path} holds {len(scene)} objects; give one file, or a folder for --out, not {picture}")
     if not several and picture.is_dir():
         raise ValueError(f"{picture} is a folder; give a file for --out, such as {picture / 'object.png'}")
-    if not several and picture.suffix.lower() != ".png":
-        raise ValueError(f"{picture} is no name for a PNG; give a file for --out such as {picture.with_suffix('.png')}")
+    if not several and picture.suffix.lower() not in (".png", ".gif"):
+        raise ValueError(f"{picture} is no name for a picture; give --out a name such as {picture.with_suffix('.png')}")
     view = load_view(path, scene, err)
     for h in scene:
         target = picture / f"object_{h.object_id}.png" if several else picture
         found = None if view is None else view.segments.get(h.object_id)
-        draw_object(target, h, None if view is None else view.frame, found)
+        frame = None if view is None else view.frame
+        if target.suffix.lower() == ".gif":
+            draw_turning(target, h, frame)
+        else:
+            draw_object(target, h, frame, found)
         report(h, out)
         out.print(f"  {target}", highlight=False, soft_wrap=True)
 

@@ -44,8 +44,23 @@ def viewpoint(frame: ObjectFrame, size: int, behind: bool = False) -> Viewpoint:
         elevation = min(float(np.arcsin(position[2] / distance)), _HIGHEST)
         away = -position[:2] / max(float(np.linalg.norm(position[:2])), 1e-9)
         position = distance * np.array([*(np.cos(elevation) * away), np.sin(elevation)])
+    return _viewpoint(position, size)
+
+
+def orbit(frame: ObjectFrame, size: int, steps: int) -> list[Viewpoint]:
+    """Viewpoints all around the cube, the first on the camera's side, from at most 35 degrees above."""
+    position = frame.to_cube(np.zeros(3))
+    distance = float(np.linalg.norm(position))
+    elevation = min(float(np.arcsin(position[2] / distance)), _HIGHEST)
+    azimuth = float(np.arctan2(position[1], position[0])) + 2.0 * np.pi * np.arange(steps) / steps
+    across = np.cos(elevation) * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+    return [_viewpoint(distance * np.array([x, y, np.sin(elevation)]), size) for x, y in across]
+
+
+def _viewpoint(position: Float[np.ndarray, "3"], size: int) -> Viewpoint:
+    """A camera at `position` (cube units) that looks at the cube's centre."""
     T = look_at(position, np.zeros(3))
-    _, directions = pinhole_rays(T, 0.5 * size * distance / RADIUS, size)
+    _, directions = pinhole_rays(T, 0.5 * size * float(np.linalg.norm(position)) / RADIUS, size)
     return Viewpoint(T, directions.astype(np.float64), size)
 
 

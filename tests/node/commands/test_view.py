@@ -13,9 +13,11 @@ import cv2
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 
 import node.commands.replay
 from node.__main__ import main
+from node.figures.turning import draw_turning
 from node.viewer.page import Page
 from node.viewer.page_guard import HOST
 from node.viewer.scene3d import camera_view
@@ -86,7 +88,7 @@ def test_out_draws_a_picture_and_opens_no_page(
     assert main(["view", str(results / "object_1.npz"), "--out", str(one)]) == 0
     assert (cv2.imread(str(one)) != with_view).any(axis=2).mean() > 0.01  # the camera's view is part of the picture
     assert main(["view", str(results / "object_1.npz"), "--out", str(tmp_path / "a.jpg")]) == 1
-    assert f"a.jpg is no name for a PNG; give a file for --out such as {one}" in capsys.readouterr().err
+    assert f"a.jpg is no name for a picture; give --out a name such as {one}" in capsys.readouterr().err
     assert main(["view", str(results), "--out", str(one)]) == 1
     assert f"holds 2 objects; give one file, or a folder for --out, not {one}" in capsys.readouterr().err
     monkeypatch.setattr(
@@ -94,6 +96,30 @@ def test_out_draws_a_picture_and_opens_no_page(
     )
     assert main(["view", str(results), "--out", str(tmp_path / "both")]) == 0
     assert sorted(p.name for p in (tmp_path / "both").iterdir()) == ["object_1.png", "object_2.png"]
+
+
+def test_out_draws_turning_hypotheses(
+    results: Path, tmp_path: Path, mug: Hypotheses, capsys: pytest.CaptureFixture
+) -> None:
+    """A readable GIF beside whose still view (the first panel) the shapes turn."""
+    moving = tmp_path / "new" / "mug.gif"
+    frame = read_frame_folder(results / "frame")
+    draw_turning(moving, mug, frame, steps=3)
+    with Image.open(moving) as picture:
+        pictures = []
+        for k in range(picture.n_frames):
+            picture.seek(k)
+            pictures.append(np.asarray(picture.convert("RGB")).astype(int))
+    assert len(pictures) == 3 and [p.name for p in moving.parent.iterdir()] == ["mug.gif"]
+    side = pictures[0].shape[0]
+    for other in pictures[1:]:
+        changed = (np.abs(other - pictures[0]).max(axis=2) > 30).mean(axis=0)
+        assert changed[: side // 2].max() == 0.0 and changed[side:].max() > 0.1
+    calls = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("node.commands.view.draw_turning", lambda *given: calls.append(given))
+        assert main(["view", str(results / "object_1.npz"), "--out", str(moving)]) == 0
+    assert calls[0][0] == moving and str(moving) in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("change", "says"), [("stamp", "but object 1 is of"), ("cut", "color.png is cut short")])
