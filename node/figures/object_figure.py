@@ -188,12 +188,12 @@ def _add_bar(figure: Figure, colours: str | Colormap, top: float, axes: list[Axe
 
 
 def _write_summary(ax: Axes, h: Hypotheses) -> None:
-    text = [textwrap.fill(part, 46) for part in answer(summarise(h)).split("; ")]
-    ax.text(0.03, 0.97, "\n".join(text), va="top", fontsize=9, transform=ax.transAxes)
+    text = [textwrap.fill(part, 41) for part in answer(summarise(h)).split("; ")]
+    ax.text(0.03, 1.0, "\n".join(text), va="top", fontsize=9, transform=ax.transAxes)
     rows = {**figures(h), **diagnostics(h)}
     for i, (name, value) in enumerate(list(rows.items())[:_ROWS]):
-        ax.text(0.03, 0.68 - 0.065 * i, name, fontsize=8, color="#666666", transform=ax.transAxes)
-        ax.text(0.36, 0.68 - 0.065 * i, value, fontsize=8, transform=ax.transAxes)
+        ax.text(0.03, 0.63 - 0.058 * i, name, fontsize=8, color="#666666", transform=ax.transAxes)
+        ax.text(0.36, 0.63 - 0.058 * i, value, fontsize=8, transform=ax.transAxes)
     doubts = "\n".join(textwrap.fill(line, 50) for line in warnings(h))
     ax.text(0.03, 0.29, doubts, va="top", fontsize=8, color="#b03020", transform=ax.transAxes)
     unseen = (
