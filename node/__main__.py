@@ -118,7 +118,7 @@ def _view(args: Sequence[str]) -> int:
         raise ValueError("give either FILE, hypotheses to look at, or --live ENDPOINT of a node that runs")
     if options.live is not None:
         if options.out is not None:
-            raise ValueError("--out draws a file's picture; leave it away with --live")
+            raise ValueError("--out draws a file's picture; omit it with --live")
         from node.commands.view_live import watch
 
         watch(options.live, options.node, options.port, options.token, Console(), Console(stderr=True))
