@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.camera import Camera
+from foundation.one_line import one_line
 
 Model = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 _COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
@@ -145,7 +146,7 @@ def _fit(views: Sequence[View], size: tuple[int, int], model: Model) -> tuple[Ca
         D = np.ravel(D)[: _COEFFICIENTS[model]]
         camera = Camera(size[0], size[1], K, D, model)
     except (cv2.error, ValueError) as error:
-        what = getattr(error, "err", "") or " ".join(str(error).split())
+        what = getattr(error, "err", "") or one_line(error)
         raise ValueError(
             f"no {model} camera fits these {len(views)} views ({what}); take views with the board tilted by 30 degrees"
             " or more, or try another model"

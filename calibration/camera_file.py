@@ -1,6 +1,5 @@
 """Camera files: the YAML that ROS's camera_info_manager writes and reads, with what a calibration knows besides."""
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,8 @@ import numpy as np
 import yaml
 
 from calibration.camera import Camera
+from foundation.one_line import one_line
+from foundation.whole_file import write_whole
 
 # ROS's reader takes the keys that it knows and passes over this one.
 _OURS = "farside_calibration"
@@ -40,13 +41,7 @@ def write_camera(path: Path, camera: Camera, name: str = "camera") -> None:
         ours["distortion_std"] = _matrix(camera.distortion_std[None])
     if ours:
         content[_OURS] = ours
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120), encoding="utf-8")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    write_whole(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120))
 
 
 def read_camera(path: Path) -> Camera:
@@ -56,7 +51,7 @@ def read_camera(path: Path) -> Camera:
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise FileNotFoundError(f"{path}: no such camera file; `farside calibrate` writes one") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not YAML ({' '.join(str(error).split())}); calibrate again") from None
+        raise ValueError(f"{path} is not YAML ({one_line(error)}); calibrate again") from None
     try:
         if not isinstance(content, Mapping):
             raise ValueError("it has no keys")

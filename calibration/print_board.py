@@ -1,6 +1,5 @@
 """Boards to print: PDF and PNG pages in true millimetres."""
 
-import os
 import struct
 import zlib
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from calibration.boards import Board
+from foundation.whole_file import write_whole
 
 Paper = Literal["A4", "A3", "letter"]
 PAPERS: dict[str, tuple[float, float]] = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}  # mm
@@ -30,13 +30,7 @@ def write_target(path: Path, board: Board, paper: Paper = "A4") -> None:
     (width, height), dark = _page(board, paper)
     note = f"{board}   print at 100%, this line is {_RULER:g} mm, measure it"
     encode = _pdf if path.suffix.lower() == ".pdf" else _png
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(encode(width, height, dark, note))
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    write_whole(path, encode(width, height, dark, note))
 
 
 def _page(board: Board, paper: Paper) -> tuple[tuple[float, float], Float[np.ndarray, "n 4"]]:

@@ -15,6 +15,8 @@ from typing import Literal, Self
 import serial
 from serial.tools import list_ports
 
+from foundation.one_line import one_line
+
 # grbl's own words (doc/csv of grbl 1.1) for what a turntable can meet; others are given by number.
 ERRORS = {
     1: "G-code words consist of a letter and a value. Letter was not found.",
@@ -325,7 +327,7 @@ class Turntable:
     def _lost(self, error: Exception) -> TurntableError:
         if isinstance(error, serial.SerialTimeoutException):
             return self._silent("what was sent")
-        return TurntableError(f"turntable on {self.port} is gone ({_words(error)}); check the cable and its power")
+        return TurntableError(f"turntable on {self.port} is gone ({one_line(error)}); check the cable and its power")
 
     def _silent(self, what: str) -> TurntableError:
         noise = f" and {self.garbage} bytes of garbage were seen" if self.garbage else ""
@@ -343,8 +345,4 @@ class Turntable:
             return f"{self.port}: not permitted; add yourself to the group that owns it (often dialout)"
         if number in (11, 16) or "lock" in str(error).lower():
             return f"{self.port} is busy: another program has it open; close that program"
-        return f"{self.port} cannot be opened ({_words(error)}); give a serial port, such as /dev/ttyUSB0"
-
-
-def _words(error: Exception) -> str:
-    return " ".join(str(error).split())
+        return f"{self.port} cannot be opened ({one_line(error)}); give a serial port, such as /dev/ttyUSB0"

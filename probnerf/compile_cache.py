@@ -7,6 +7,7 @@ does not tell apart (a local function, or another package's) is left to `jax.jit
 than CPUs, and where `FARSIDE_PROGRAMS` names no folder.
 """
 
+import contextlib
 import hashlib
 import inspect
 import os
@@ -28,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import serialize_executable
 
+from foundation.whole_file import write_whole
 from probnerf.kernel import library
 from probnerf.kernel.build import library_path
 
@@ -149,12 +151,8 @@ def _write(path: Path, compiled: jax.stages.Compiled) -> None:
     devices = {d.id for s in jax.tree.leaves(compiled.input_shardings) for d in s.device_set}
     # the tree as an object: equinox's marks of absent fields do not survive in a pickled treedef
     answer = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))
-    partial = path.with_suffix(f".{os.getpid()}")
-    try:
-        partial.write_bytes(pickle.dumps((code, sorted(devices), answer)))
-        partial.replace(path)
-    except OSError:  # a full disk costs the next start its time, and no answer
-        partial.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # a full disk costs the next start its time, and no answer
+        write_whole(path, pickle.dumps((code, sorted(devices), answer)))
 
 
 def _read(path: Path, given: dict[str, Any]) -> Callable[..., Any]:

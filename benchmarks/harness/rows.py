@@ -1,10 +1,11 @@
 """A study's figures as rows, which a table shows and `--json` writes."""
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+
+from foundation.whole_file import write_whole
 
 
 @dataclass(frozen=True)
@@ -27,10 +28,4 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
 
 def write_json(path: Path, value: object) -> None:
     """Write a JSON file, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    write_whole(path, json.dumps(value, indent=1) + "\n")

@@ -1,7 +1,6 @@
 """Capturing an object on a turntable: turn, wait, take a posed view, write it; whatever was taken is kept."""
 
 import json
-import os
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +17,7 @@ from rich.table import Table
 from calibration.boards import Board, parse_board
 from calibration.turntable import Turntable, TurntableConfig
 from calibration.turntable_pose import PlateNotFoundError, PlatePose, locate_plate, plate_axis, turned
+from foundation.whole_file import write_whole
 from node.options import Capture
 from perception.observation.turntable_views import (
     PlateMaskConfig,
@@ -58,9 +58,7 @@ class Session:
     def save(self) -> None:
         """Write the file as a whole, or not at all."""
         said = {key: value for key, value in vars(self).items() if key != "folder"}
-        temporary = self.path.with_suffix(".tmp")
-        temporary.write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
-        os.replace(temporary, self.path)
+        write_whole(self.path, json.dumps(said, indent=1) + "\n")
 
     def missing(self) -> list[int]:
         """Views that are not there yet, in order."""

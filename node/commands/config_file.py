@@ -13,6 +13,8 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 import yaml
 
+from foundation.one_line import one_line
+
 T = TypeVar("T")
 
 
@@ -37,7 +39,7 @@ def load_config(path: Path, into: type[T]) -> T:
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise FileNotFoundError(f"{path}: no such configuration file; see launch/replay.yaml for one") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not YAML ({' '.join(str(error).split())})") from None
+        raise ValueError(f"{path} is not YAML ({one_line(error)})") from None
     try:
         return from_mapping(into, {} if values is None else values)
     except (TypeError, ValueError) as error:

@@ -1,6 +1,5 @@
 """All pictures: an object's hypotheses, and the curves of a training run."""
 
-import os
 import textwrap
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from matplotlib.colors import Colormap, ListedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from foundation.whole_file import whole_file
 from node.figures import voxel_renderer
 from node.figures.summary import answer, diagnostics, figures, warnings
 from perception.answers.hypotheses import Hypotheses
@@ -215,10 +215,5 @@ def _smoothed(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 
 def save_figure(figure: Figure, path: Path) -> None:
     """Write the PNG whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with whole_file(path) as part:
         figure.savefig(part, format="png")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)

@@ -17,6 +17,7 @@ from typing import Any, Self
 import zenoh
 import zenoh.ext
 
+from foundation.one_line import one_line
 from node.ros.message_counts import Counts, Rate
 from node.ros.messages import decode, encode, make, type_hash
 from node.ros.rmw_zenoh import Node, attachment, gid, key, quality, read_attachment
@@ -68,7 +69,7 @@ class Publisher:
             try:
                 self._publisher.put(data, attachment=attachment(self._sequence, time.time_ns(), self._source))
             except zenoh.ZError as error:
-                self._counts.add(self.name, "failed", _line(error))
+                self._counts.add(self.name, "failed", one_line(error))
                 return False
         self._counts.add(self.name, "sent")
         return True
@@ -256,9 +257,9 @@ class Bus:
                     return "too_fast", f"messages come faster than max_rate ({self.config.max_rate:g} Hz)"
                 take(item, tag)
             except ValueError as error:
-                return "refused" if refuse else "malformed", _line(error)
+                return "refused" if refuse else "malformed", one_line(error)
             except Exception as error:  # a handler's fault must not end the service
-                return "failed", f"{type(error).__name__}: {_line(error)}"
+                return "failed", f"{type(error).__name__}: {one_line(error)}"
             return "received", ""
 
         def loop() -> None:
@@ -271,7 +272,7 @@ class Bus:
                             refuse(item, trouble)
                         item.drop()  # now, not when it is collected: the asker waits for the end of answers
                     except zenoh.ZError as error:  # who asked has gone
-                        self.counts.add(name, "failed", _line(error))
+                        self.counts.add(name, "failed", one_line(error))
 
         thread = threading.Thread(target=loop, name=f"bus {name}", daemon=True)
         thread.start()
@@ -294,10 +295,6 @@ def _open(config: BusConfig) -> zenoh.Session:
         reason = text.split(" at /")[0].strip()
         listen, connect = ", ".join(config.listen) or "nothing", ", ".join(config.connect) or "nothing"
         raise OSError(f"the bus cannot open (listen {listen}; connect {connect}): {' '.join(reason.split())}") from None
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _tag(item: Any) -> tuple[int, bytes]:

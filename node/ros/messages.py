@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
+from foundation.one_line import one_line
 from perception.answers.hypotheses import Hypotheses
 from perception.observation.object_frame import ObjectFrame
 from perception.sources.frame import Frame
@@ -159,7 +160,7 @@ def decode(data: bytes, kind: str) -> Any:
     try:
         message = types().deserialize_cdr(data, kind)
     except (SerdeError, IndexError, OverflowError, MemoryError, AssertionError) as error:
-        raise ValueError(f"{len(data)} bytes are no {kind}: {' '.join(str(error).split())}") from None
+        raise ValueError(f"{len(data)} bytes are no {kind}: {one_line(error)}") from None
     # rosbags takes a text that is cut short for a shorter text; written again, it would be longer than what came.
     if 4 + types().get_msgdef(kind).getsize_cdr(0, message, types()) > max(len(data), 5):
         raise ValueError(f"{len(data)} bytes are no {kind}: they are cut short")

@@ -8,7 +8,6 @@ gives equal bytes.
 
 import itertools
 import json
-import os
 import re
 import zipfile
 import zlib
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from foundation.whole_file import whole_file
 from perception.answers.hypotheses import Hypotheses
 from perception.observation.object_frame import ObjectFrame
 
@@ -68,22 +68,17 @@ def save(path: str | Path, hypotheses: Hypotheses) -> None:
     }
     if h.T_world_camera is not None:
         arrays["T_world_camera"] = np.asarray(h.T_world_camera, np.float64)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         # Not np.savez_compressed, whose level of compression takes six times as long for a seventh less. Members opened
         # by name carry zip's zero date, so that equal content gives equal bytes.
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        with whole_file(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for name, array in arrays.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     np.lib.format.write_array(member, array, allow_pickle=False)
-        os.replace(temporary, path)
     except OSError as error:
         raise OSError(
             f"{path} cannot be written ({error.strerror or error}); make room or give another place"
         ) from None
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def load(path: str | Path) -> Hypotheses:

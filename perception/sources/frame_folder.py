@@ -1,7 +1,6 @@
 """The frame folder: color.png, depth.png, label.png and meta.json, read and written."""
 
 import json
-import os
 import zlib
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
 from calibration.camera import Camera
+from foundation.whole_file import write_whole
 from perception.sources.frame import SATURATED, Frame, known_counts
 from probnerf.geometry import rigid
 
@@ -110,18 +110,8 @@ def write_frame_folder(path: Path | str, frame: Frame) -> None:
         (path / name).unlink(missing_ok=True)
     for name, image in images.items():
         if image is not None:
-            _replace(path / name, cv2.imencode(".png", image)[1].tobytes())
-    _replace(path / "meta.json", json.dumps(meta, indent=1).encode())
-
-
-def _replace(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(data)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+            write_whole(path / name, cv2.imencode(".png", image)[1].tobytes())
+    write_whole(path / "meta.json", json.dumps(meta, indent=1))
 
 
 def read_png(path: Path) -> Shaped[np.ndarray, "h w *c"]:

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from calibration.camera import Camera
+from foundation.one_line import one_line
 from perception.sources.frame import Frame, known_counts
 from perception.sources.time_limit import within
 
@@ -135,7 +136,7 @@ class OakSource:
                 try:
                     group = queue.get(_POLL)
                 except (RuntimeError, dai.MessageQueue.QueueException) as error:
-                    raise OSError(f"{self._images.name} was lost ({_line(error)})") from None
+                    raise OSError(f"{self._images.name} was lost ({one_line(error)})") from None
                 frame = None
                 if isinstance(group, dai.MessageGroup):
                     frame, previous = self._frame(group, opened, previous)
@@ -166,7 +167,7 @@ class OakSource:
             opened.pipeline.start()
         except RuntimeError as error:
             _close(opened)
-            raise OSError(f"{self._images.name} does not start ({_line(error)}); plug it in again") from None
+            raise OSError(f"{self._images.name} does not start ({one_line(error)}); plug it in again") from None
         return opened, queue
 
     def _frame(self, group: dai.MessageGroup, opened: Opened, previous: int | None) -> tuple[Frame | None, int]:
@@ -240,7 +241,7 @@ class DeviceImages:
         try:
             device = dai.Device(info)
         except RuntimeError as error:
-            raise OSError(f"{self.name} cannot be opened ({_line(error)}); is another program using it?") from None
+            raise OSError(f"{self.name} cannot be opened ({one_line(error)}); is another program using it?") from None
         try:
             device.setMaxReconnectionAttempts(0)  # OakSource reconnects, and counts
             camera = self._camera or _factory_camera(
@@ -269,7 +270,7 @@ class DeviceImages:
             return Opened(pipeline, picture, depth, camera, self._camera is None, clock_ns, device.close)
         except RuntimeError as error:
             device.close()
-            raise OSError(f"{self.name} cannot be set up ({_line(error)}); is it a camera with depth?") from None
+            raise OSError(f"{self.name} cannot be set up ({one_line(error)}); is it a camera with depth?") from None
         except BaseException:
             device.close()
             raise
@@ -304,7 +305,7 @@ def camera_of_device_json(path: Path | str, socket: str = "CAM_A", width: int = 
     try:
         calibration = dai.CalibrationHandler(path.absolute())
     except RuntimeError as error:
-        raise ValueError(f"{path} is no calibration of an OAK camera ({_line(error)}); save it again") from None
+        raise ValueError(f"{path} is no calibration of an OAK camera ({one_line(error)}); save it again") from None
     return _factory_camera(calibration, sockets[socket], width, height, str(path))
 
 
@@ -321,7 +322,7 @@ def _factory_camera(
         lens = calibration.getDistortionModel(socket)
         distortion = np.array(calibration.getDistortionCoefficients(socket))
     except RuntimeError as error:
-        raise ValueError(f"{name} has no calibration of {socket.name} ({_line(error)}); calibrate it") from None
+        raise ValueError(f"{name} has no calibration of {socket.name} ({one_line(error)}); calibrate it") from None
     if undistorted:
         distortion = np.zeros(5)
     elif lens != dai.CameraModel.Perspective:
@@ -344,7 +345,3 @@ def _close(opened: Opened) -> None:
         within(_CLOSING_S, close, "")
     except (OSError, RuntimeError):  # a device that is gone need not answer
         pass
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Self, TypeVar
 
+from foundation.one_line import one_line
 from perception.sources.frame import Frame, Source
 
 _CLOSING_S = 2.0  # that a source may take to end before its thread is left behind
@@ -113,7 +114,7 @@ class Reader:
                 rate,
                 {"newest": self._replaced} | {listener.name: listener.dropped for listener in self._listeners},
                 (*self.source.notes, *self._left_behind),
-                None if self._error is None else " ".join(str(self._error).split()) or type(self._error).__name__,
+                None if self._error is None else one_line(self._error),
                 self.over,
             )
 

@@ -20,6 +20,8 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
+from foundation.one_line import one_line
+from foundation.whole_file import whole_file
 from perception.sources.frame import SATURATED, Frame, known_counts
 from perception.sources.ros_images import MM, POSE_TOPIC
 from perception.sources.schedule_entry import SCHEDULE_TOPIC, Scheduled
@@ -179,7 +181,7 @@ class Recorder:
         self._writer.add_message(self._channels[message.topic], message.stamp_ns, message.data, message.stamp_ns)
 
     def _fail(self, error: Exception) -> None:
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+        reason = getattr(error, "strerror", None) or one_line(error)
         self.error = (
             f"{self.path}: recording ended at frame {self.frames} ({reason}); make room or record elsewhere; what was"
             " written before can be read"
@@ -195,10 +197,8 @@ def write_log(path: Path | str, frames: Iterable[Frame]) -> int:
     Raises `ValueError` where there is no frame or a label does not fit 16 bits, OSError where writing fails.
     """
     path = Path(path)
-    part = path.with_name(path.name + ".part")
-    part.unlink(missing_ok=True)
     small = RecordConfig(colour="png", depth="millimetres", compression="zstd", chunk_bytes=1 << 18)
-    try:
+    with whole_file(path) as part:
         with Recorder(part, small, wait=True) as recorder:
             for frame in frames:
                 recorder.write_frame(frame)
@@ -206,9 +206,6 @@ def write_log(path: Path | str, frames: Iterable[Frame]) -> int:
             raise OSError(recorder.error)
         if not recorder.frames:
             raise ValueError(f"{path}: there is no frame to write")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
     return recorder.frames
 
 

@@ -13,6 +13,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from calibration.camera import Camera
+from foundation.one_line import one_line
 from perception.sources.frame import Frame
 from perception.sources.ros_images import (
     POSE_TOPIC,
@@ -244,7 +245,7 @@ def open_log(path: Path) -> tuple[_Read, dict[str, str], list[str]]:
                     kind = connection.msgtype
                     yield _Received(connection.topic, kind, time, reader.deserialize(raw, kind))
         except Exception as error:  # whichever parser meets the damage first; the caller's own errors do not pass here
-            raise ValueError(f"{path} is damaged ({_line(error)}); record it again") from None
+            raise ValueError(f"{path} is damaged ({one_line(error)}); record it again") from None
 
     try:
         with AnyReader([path], default_typestore=_TYPES) as reader:
@@ -256,7 +257,7 @@ def open_log(path: Path) -> tuple[_Read, dict[str, str], list[str]]:
         remedy = (
             "repair it with `rosbag reindex`" if path.suffix == ".bag" else "give a .mcap, .bag or ROS 2 bag folder"
         )
-        raise ValueError(f"{path} cannot be read as a recording ({_line(error)}); {remedy}") from None
+        raise ValueError(f"{path} cannot be read as a recording ({one_line(error)}); {remedy}") from None
 
 
 def _open_cut(paths: list[Path]) -> tuple[_Read, dict[str, str], list[str]]:
@@ -299,7 +300,3 @@ def _open_cut(paths: list[Path]) -> tuple[_Read, dict[str, str], list[str]]:
     if not kinds:
         raise ValueError(f"{paths[0]} holds no readable message; record it again")
     return read, kinds, notes
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

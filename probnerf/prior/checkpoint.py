@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from foundation.whole_file import write_whole
 from probnerf.prior.networks import PRESETS, ProbNeRF
 
 FORMAT = "farside-prior-1"
@@ -36,10 +36,7 @@ def save_prior(path: Path, model: ProbNeRF, metadata: dict[str, Any]) -> None:
     """Write atomically. `metadata` must be JSON-serialisable."""
     arrays = {name: np.ascontiguousarray(leaf) for name, leaf in _named(model).items()}
     story = {"format": FORMAT, "preset": model.preset.name, **metadata}
-    data = save(arrays, metadata={"farside": json.dumps(story, sort_keys=True)})
-    temporary = path.with_suffix(".tmp")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)
+    write_whole(path, save(arrays, metadata={"farside": json.dumps(story, sort_keys=True)}))
 
 
 def load_prior(path: Path | None = None, preset: str | None = None) -> Prior:

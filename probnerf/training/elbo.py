@@ -28,6 +28,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
+from foundation.whole_file import whole_file
 from probnerf.likelihood.dispatch import map_with_gradient, weighted_terms
 from probnerf.likelihood.settings import Likelihood
 from probnerf.objects.tabletop import description, sample_object
@@ -247,12 +248,10 @@ def train_step(
 
 def save_checkpoint(path: Path, state: TrainState) -> None:
     """Atomic: a killed run leaves the old checkpoint or the new one, never half of one."""
-    temporary = path.with_suffix(".tmp")
-    with open(temporary, "wb") as file:
+    with whole_file(path) as part, part.open("wb") as file:
         eqx.tree_serialise_leaves(file, state)
         file.flush()
         os.fsync(file.fileno())
-    os.replace(temporary, path)
 
 
 def train(

@@ -9,7 +9,6 @@ Into the unit cube: p_cube = 2 (p_world - barycentre) / scale, z up: the scale i
 does, an object's base is 0.375 scale below the barycentre and its largest side 0.7 scale. Pixel centres lie at +0.5.
 """
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from foundation.whole_file import write_whole
 from probnerf.geometry import look_at, rigid
 from probnerf.prior.encoder_input import ENCODER_RADIUS
 from probnerf.training.pictures import ViewSet
@@ -70,7 +70,7 @@ def write_intrinsics(
     rows = ((focal, *centre, 0.0), barycentre, (scale,))
     lines = [" ".join(repr(float(x)) for x in row) for row in rows] + [f"{size[0]} {size[1]}"]
     folder.mkdir(parents=True, exist_ok=True)
-    _replace(folder / "intrinsics.txt", ("\n".join(lines) + "\n").encode())
+    write_whole(folder / "intrinsics.txt", "\n".join(lines) + "\n")
 
 
 def write_view(
@@ -85,9 +85,9 @@ def write_view(
         (folder / name).mkdir(parents=True, exist_ok=True)
     white = np.where(mask[..., None], rgb, np.uint8(255))
     bgra = np.dstack([white[..., ::-1], np.where(mask, 255, 0).astype(np.uint8)])
-    _replace(folder / "rgb" / f"{index:06d}.png", cv2.imencode(".png", bgra)[1].tobytes())
+    write_whole(folder / "rgb" / f"{index:06d}.png", cv2.imencode(".png", bgra)[1].tobytes())
     text = " ".join(repr(float(x)) for x in np.asarray(T_world_camera, np.float64).ravel())
-    _replace(folder / "pose" / f"{index:06d}.txt", (text + "\n").encode())
+    write_whole(folder / "pose" / f"{index:06d}.txt", text + "\n")
 
 
 def write_instance(root: Path, instance: Instance) -> Path:
@@ -97,12 +97,6 @@ def write_instance(root: Path, instance: Instance) -> Path:
     for index, view in enumerate(zip(instance.rgb, instance.mask, instance.T_world_camera, strict=True)):
         write_view(folder, index, *view)
     return folder
-
-
-def _replace(path: Path, data: bytes) -> None:
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)
 
 
 # ----------------------------------------------------------------------------------------------------- reading

@@ -1,0 +1,43 @@
+"""A file is there whole, or what was there before is."""
+
+from pathlib import Path
+
+import pytest
+
+from foundation.one_line import one_line
+from foundation.whole_file import whole_file, write_whole
+
+
+def test_a_file_and_its_folder_appear(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.txt"
+    write_whole(path, "½\n")
+    assert path.read_bytes() == "½\n".encode()
+    write_whole(path, b"\x00")
+    assert path.read_bytes() == b"\x00" and list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("old", [None, b"old"])
+def test_an_error_leaves_what_was_there_and_nothing_else(tmp_path: Path, old: bytes | None) -> None:
+    path = tmp_path / "a.bin"
+    if old is not None:
+        path.write_bytes(old)
+    before = list(tmp_path.iterdir())
+    with pytest.raises(KeyboardInterrupt), whole_file(path) as part:
+        part.write_bytes(b"half")
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == before and (old is None or path.read_bytes() == old)
+
+
+def test_a_reader_never_sees_half_of_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    write_whole(path, b"old")
+    with whole_file(path) as part:
+        part.write_bytes(b"half")
+        assert path.read_bytes() == b"old"
+        part.write_bytes(b"half and half")
+    assert path.read_bytes() == b"half and half"
+
+
+def test_an_error_is_one_line() -> None:
+    assert one_line(ValueError("a\n  b\tc ")) == "a b c"
+    assert one_line(TimeoutError()) == "TimeoutError"
