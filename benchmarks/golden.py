@@ -26,7 +26,7 @@ from perception.inference.tracker import Tracker
 from perception.observation.segmentation import segment
 from perception.simulation.sample_recording import CAMERA, SCENE, SENSOR
 from perception.simulation.sensor_faults import sense
-from perception.simulation.simulated_camera import Placed, Scene, place_camera, render
+from perception.simulation.simulated_camera import PlacedObject, TableScene, place_camera, render
 from perception.sources.frame import Frame
 from perception.sources.open_source import open_source
 from probnerf.prior.checkpoint import Prior, load_prior
@@ -46,7 +46,7 @@ class Golden:
     """Also so many single validation objects, compared by p_occupied alone."""
 
 
-def frame_from(position: tuple[float, float, float], scene: Scene = SCENE) -> Frame:
+def frame_from(position: tuple[float, float, float], scene: TableScene = SCENE) -> Frame:
     """A simulated frame with depth, true labels and the camera's pose; the camera looks at the scene's middle."""
     T_world_camera = place_camera(position, (0.0, 0.01, 0.03))
     return sense(render(scene, CAMERA, T_world_camera), CAMERA, T_world_camera, seed=0, config=SENSOR)
@@ -85,8 +85,8 @@ def validation(prior: Prior, count: int) -> Iterator[tuple[str, Hypotheses]]:
     for i in range(count):
         rng = np.random.default_rng([FIRST_VALIDATION_SEED, i])
         angle, height = rng.uniform(0, 2 * np.pi), rng.uniform(0.2, 0.5)
-        placed = Placed(FIRST_VALIDATION_SEED + i, 0.0, 0.0, float(rng.uniform(0, 2 * np.pi)))
-        frame = frame_from((0.55 * np.cos(angle), 0.55 * np.sin(angle), height), Scene((placed,)))
+        placed = PlacedObject(FIRST_VALIDATION_SEED + i, 0.0, 0.0, float(rng.uniform(0, 2 * np.pi)))
+        frame = frame_from((0.55 * np.cos(angle), 0.55 * np.sin(angle), height), TableScene((placed,)))
         try:
             found = segment(frame, 1)[0]
         except ValueError as error:

@@ -32,7 +32,7 @@ class CalibrateConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class BoardView:
     """Corners of a board in one picture."""
 
     name: str
@@ -44,7 +44,7 @@ class View:
 class FittedView:
     """A view with the pose that the calibration gives it."""
 
-    view: View
+    view: BoardView
     T_camera_board: Float[np.ndarray, "4 4"]
     residuals: Float[np.ndarray, "n 2"]  # px, found less predicted
 
@@ -65,13 +65,13 @@ class Calibration:
 
 
 def distinct(
-    views: Sequence[View], size: tuple[int, int], config: CalibrateConfig
-) -> tuple[list[View], list[tuple[str, str]]]:
+    views: Sequence[BoardView], size: tuple[int, int], config: CalibrateConfig
+) -> tuple[list[BoardView], list[tuple[str, str]]]:
     """The views that differ, at most `most_views`, and the others' names with the reason. `size`: width, height (px).
 
     Nearly equal views would count the same evidence twice, and make the standard deviations too small.
     """
-    kept: list[View] = []
+    kept: list[BoardView] = []
     same: list[tuple[str, str]] = []
     least = config.least_motion * float(np.hypot(*size))
     for view in views:
@@ -87,14 +87,14 @@ def distinct(
     return kept, same
 
 
-def motion(a: View, b: View) -> float:
+def motion(a: BoardView, b: BoardView) -> float:
     """Mean distance (px) between the corners that two views share; infinite where they share none."""
     i, j = np.nonzero((a.points[:, None] == b.points).all(axis=-1))
     return float(np.linalg.norm(a.pixels[i] - b.pixels[j], axis=1).mean()) if len(i) else np.inf
 
 
 def calibrate(
-    views: Sequence[View],
+    views: Sequence[BoardView],
     size: tuple[int, int],
     model: Model = "plumb_bob",
     config: CalibrateConfig | None = None,
@@ -126,7 +126,7 @@ def calibrate(
     return Calibration(camera, fitted, tuple(dropped), _trouble(camera, fitted, config))
 
 
-def _fit(views: Sequence[View], size: tuple[int, int], model: Model) -> tuple[Camera, tuple[FittedView, ...]]:
+def _fit(views: Sequence[BoardView], size: tuple[int, int], model: Model) -> tuple[Camera, tuple[FittedView, ...]]:
     points, pixels = [v.points for v in views], [v.pixels for v in views]
     K: Any
     D: Any

@@ -86,7 +86,7 @@ class TurntableConfig:
 
 
 @dataclass(frozen=True)
-class Status:
+class TurntableStatus:
     """One report of the controller."""
 
     state: str  # Idle, Run, Hold, Jog, Alarm, Door, Check, Home or Sleep
@@ -151,7 +151,7 @@ class Turntable:
                 pass
         self._line = None
 
-    def status(self) -> Status:
+    def status(self) -> TurntableStatus:
         """The controller's state and the table's angle now."""
         deadline = time.monotonic() + self.config.reply_timeout
         while True:
@@ -258,7 +258,7 @@ class Turntable:
             }.get(state, "look at the controller")
             raise TurntableError(f"turntable on {self.port} is in state {state}; {remedy}")
 
-    def _report(self, line: str) -> Status | None:
+    def _report(self, line: str) -> TurntableStatus | None:
         """Of `<Run|MPos:1.0,0.0,0.0|WCO:...>`; None where noise has bitten a piece off."""
         state, *fields = line.strip("<>").split("|")
         values: dict[str, list[float]] = {}
@@ -281,7 +281,7 @@ class Turntable:
         work = position[at]
         if "WPos" not in values and len(self._offset) > at:
             work -= self._offset[at]
-        return Status(state.split(":")[0], work * self.config.degrees_per_unit)
+        return TurntableStatus(state.split(":")[0], work * self.config.degrees_per_unit)
 
     def _alarm(self, line: str) -> None:
         if line.startswith("ALARM:"):

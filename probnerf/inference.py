@@ -14,7 +14,7 @@ from probnerf.likelihood.dispatch import log_likelihood
 from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.networks import ProbNeRF
-from probnerf.prior.posterior_network import Picture, encoder_positions, even_yaws, guesses
+from probnerf.prior.posterior_network import EncoderPicture, encoder_positions, even_yaws, guesses
 from probnerf.rendering import foam
 from probnerf.sampling.annealed_hmc import annealed_hmc
 from probnerf.sampling.gaussian_mixture import GaussianMixture
@@ -74,7 +74,7 @@ def without_sizes(likelihood: Likelihood) -> Likelihood:
     return replace(likelihood, lattice=replace(lattice, max_crossings=3 * lattice.planes), packed=(0, 0))
 
 
-def asks_encoder(config: InferConfig, model: Model, picture: Picture | None) -> bool:
+def asks_encoder(config: InferConfig, model: Model, picture: EncoderPicture | None) -> bool:
     """Whether there is an encoder to ask, enough for it to see, and use for what it says."""
     # delta has too many dimensions for second derivatives
     if picture is None or not config.encoder_starts or config.sample_delta or not isinstance(model, ProbNeRF):
@@ -83,7 +83,7 @@ def asks_encoder(config: InferConfig, model: Model, picture: Picture | None) -> 
 
 
 def modes_of(
-    key: Array, model: Model, observation: Observation, config: InferConfig, picture: Picture | None
+    key: Array, model: Model, observation: Observation, config: InferConfig, picture: EncoderPicture | None
 ) -> GaussianMixture | None:
     """Where tempering begins: the modes that the encoder's guesses climb to (`sampling.modes`), the pose unknown.
 
@@ -153,7 +153,7 @@ def encoder_guess(
     model: ProbNeRF,
     likelihood: Likelihood,
     observation: Observation,
-    picture: Picture,
+    picture: EncoderPicture,
     yaws: int = 24,
     draws: int = 4,
 ) -> Posterior:

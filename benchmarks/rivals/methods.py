@@ -32,7 +32,7 @@ from probnerf.likelihood.dispatch import log_likelihood
 from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.checkpoint import Prior
-from probnerf.prior.posterior_network import Picture, guesses
+from probnerf.prior.posterior_network import EncoderPicture, guesses
 from probnerf.sampling.map_estimate import map_estimate
 from probnerf.sampling.mean_field import VIConfig, mean_field
 from probnerf.sampling.modes import log_posterior
@@ -76,7 +76,7 @@ class Question:
         return self.prior.model, self.likelihood, observation, faces_of_view(observation, self.likelihood)
 
     @property
-    def picture(self) -> Picture:
+    def picture(self) -> EncoderPicture:
         return encoder_picture(self.view, self.observed[1], self.prior)
 
 

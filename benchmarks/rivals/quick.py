@@ -24,7 +24,7 @@ from probnerf.inference import encoder_guess, likelihood_of
 from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.checkpoint import Prior
 from probnerf.prior.networks import ProbNeRF
-from probnerf.prior.posterior_network import Picture, guesses
+from probnerf.prior.posterior_network import EncoderPicture, guesses
 from probnerf.rendering.occupancy import coarsen
 from probnerf.sampling.map_estimate import MAPConfig, map_estimate
 from probnerf.types import Observation
@@ -87,7 +87,7 @@ def answers(
     return result
 
 
-def encoder_picture(vessel: VesselView, cube: ObjectFrame, prior: Prior) -> Picture:
+def encoder_picture(vessel: VesselView, cube: ObjectFrame, prior: Prior) -> EncoderPicture:
     """What the encoder sees; without depth the object is at an unknown range."""
     frame = vessel.frame
     if frame.depth is None:
@@ -108,7 +108,12 @@ def warm_up(
 
 
 def encoder_alone(
-    key: Array, model: ProbNeRF, likelihood: Likelihood, observation: Observation, picture: Picture, config: RivalConfig
+    key: Array,
+    model: ProbNeRF,
+    likelihood: Likelihood,
+    observation: Observation,
+    picture: EncoderPicture,
+    config: RivalConfig,
 ) -> tuple[Float[Array, "s d"], Float[np.ndarray, "s"]]:
     """The encoder's guess: positions and weights."""
     guess = encoder_guess(key, model, likelihood, observation, picture, config.yaws, config.draws)

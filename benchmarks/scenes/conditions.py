@@ -30,7 +30,7 @@ from benchmarks.scenes.vessels import (
     vessel_picture,
     vessel_view,
 )
-from perception.simulation.simulated_camera import Placed, Scene, render
+from perception.simulation.simulated_camera import PlacedObject, TableScene, render
 from probnerf.objects.tabletop import TEST_SEEDS
 from probnerf.objects.tabletop_sampler import CUP, MUG, PITCHER
 
@@ -42,10 +42,10 @@ def any_view(seed: int) -> VesselPicture:
     """The object of a family seed from a random camera."""
     placed, T = _stand(seed)
     camera = simulated_camera(ViewConfig())
-    return VesselPicture(placed, camera, T, render(Scene((placed,)), camera, T))
+    return VesselPicture(placed, camera, T, render(TableScene((placed,)), camera, T))
 
 
-def _stand(seed: int) -> tuple[Placed, Float[np.ndarray, "4 4"]]:
+def _stand(seed: int) -> tuple[PlacedObject, Float[np.ndarray, "4 4"]]:
     return place(seed, np.random.default_rng([seed, 47]), ViewConfig())
 
 

@@ -19,7 +19,7 @@ from perception.observation.segmentation import segment
 from perception.observation.settings import ObserveConfig
 from perception.observation.visibility import seen_voxels
 from perception.simulation.sensor_faults import sense
-from perception.simulation.simulated_camera import Picture, Scene, render
+from perception.simulation.simulated_camera import FaultlessImage, TableScene, render
 from perception.sources.frame import Frame
 from probnerf.rendering.occupancy import coarsen
 
@@ -97,9 +97,9 @@ def enclosed(points: Float[np.ndarray, "n 3"], grid: int) -> np.ndarray:
 
 def picture_of(
     cloud: Cloud, camera: Camera, T_world_camera: Float[np.ndarray, "4 4"], colour: Float[np.ndarray, "3"]
-) -> Picture:
+) -> FaultlessImage:
     """What a faultless camera sees of one object on the table, lit from above the camera; its label is 1."""
-    room = render(Scene(()), camera, T_world_camera)
+    room = render(TableScene(()), camera, T_world_camera)
     inverse = np.linalg.inv(T_world_camera)
     seen = cloud.points @ inverse[:3, :3].T + inverse[:3, 3]
     fine = np.floor((camera.project(seen) + 0.5) * _SUB).astype(int)
@@ -122,7 +122,7 @@ def picture_of(
     middle = _SUB * _SUB // 2
     own = shade[..., None] * colour
     depths = np.where(hit, depth, room.depth[..., None])
-    return Picture(
+    return FaultlessImage(
         rgb=np.where(hit[..., None], own, room.rgb[:, :, None, :]).mean(axis=2),
         depth=depths[..., middle],
         nearest=np.where(hit.any(axis=-1), depths.min(axis=-1), room.nearest),

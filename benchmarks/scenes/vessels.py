@@ -17,7 +17,7 @@ from perception.observation.segmentation import Segment, segment
 from perception.observation.settings import ObserveConfig, PlaneGuess
 from perception.observation.visibility import seen_voxels
 from perception.simulation.sensor_faults import sense
-from perception.simulation.simulated_camera import Picture, Placed, Scene, place_camera, render, truth
+from perception.simulation.simulated_camera import FaultlessImage, PlacedObject, TableScene, place_camera, render, truth
 from perception.sources.frame import Frame
 from probnerf.geometry import pinhole_rays
 from probnerf.objects.ray_tracer import trace
@@ -60,15 +60,15 @@ Handle = Literal["hidden", "informative"]  # no pixel shows the handle; it shows
 class VesselPicture:
     """A vessel on the table and a camera that stands as was asked for, before any sensor."""
 
-    placed: Placed
+    placed: PlacedObject
     camera: Camera
     T_world_camera: Float[np.ndarray, "4 4"]
-    picture: Picture  # faultless
+    picture: FaultlessImage  # faultless
 
     @property
     def T_camera_object(self) -> Float[np.ndarray, "4 4"]:
         """The canonical object frame in the camera's, metres."""
-        return truth(Scene((self.placed,)), self.T_world_camera)[0]
+        return truth(TableScene((self.placed,)), self.T_world_camera)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ def vessel_picture(seed: int, handle: Handle, config: ViewConfig | None = None) 
     handle is hidden or shows, as asked for; None if it has none, or `tries` draws hold no such view.
     """
     config = config or ViewConfig()
-    shape = Placed(seed, 0.0, 0.0, 0.0).shape
+    shape = PlacedObject(seed, 0.0, 0.0, 0.0).shape
     if not bool(shape.has_handle):
         return None
     rng = np.random.default_rng([seed, 23])
@@ -103,7 +103,7 @@ def vessel_picture(seed: int, handle: Handle, config: ViewConfig | None = None) 
         placed, T_world_camera = place(seed, rng, config)
         if shows_handle(placed, T_world_camera) != (handle == "informative"):  # a small picture costs less
             continue
-        view = VesselPicture(placed, camera, T_world_camera, render(Scene((placed,)), camera, T_world_camera))
+        view = VesselPicture(placed, camera, T_world_camera, render(TableScene((placed,)), camera, T_world_camera))
         pixels, total = pixels_of_handle(view), int((view.picture.label == 1).sum())
         if handle == "hidden" and total >= config.least and not pixels:
             return view
@@ -189,9 +189,9 @@ def simulated_camera(config: ViewConfig) -> Camera:
     return Camera(config.width, config.height, K, np.zeros(5))
 
 
-def place(seed: int, rng: np.random.Generator, config: ViewConfig) -> tuple[Placed, Float[np.ndarray, "4 4"]]:
+def place(seed: int, rng: np.random.Generator, config: ViewConfig) -> tuple[PlacedObject, Float[np.ndarray, "4 4"]]:
     """A random placement and T_world_camera."""
-    placed = Placed(seed, rng.uniform(-0.05, 0.05), rng.uniform(-0.05, 0.05), rng.uniform(-np.pi, np.pi))
+    placed = PlacedObject(seed, rng.uniform(-0.05, 0.05), rng.uniform(-0.05, 0.05), rng.uniform(-np.pi, np.pi))
     return placed, stand(placed.T_world_object[:3, 3], placed.half_extent, rng, config)
 
 
@@ -206,7 +206,7 @@ def stand(
     return place_camera(tuple(position), tuple(target))
 
 
-def shows_handle(placed: Placed, T_world_camera: Float[np.ndarray, "4 4"], size: int = 96) -> bool:
+def shows_handle(placed: PlacedObject, T_world_camera: Float[np.ndarray, "4 4"], size: int = 96) -> bool:
     """Whether a small picture of the whole object shows its handle."""
     T_object_camera = np.linalg.inv(placed.T_world_object) @ T_world_camera
     T_object_camera[:3, 3] /= placed.half_extent

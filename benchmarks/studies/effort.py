@@ -35,7 +35,7 @@ from benchmarks.scenes.vessels import (
 )
 from perception.inference.controller import Estimate, estimate
 from perception.inference.settings import ControllerConfig
-from perception.simulation.simulated_camera import Placed, Scene, render
+from perception.simulation.simulated_camera import PlacedObject, TableScene, render
 from probnerf.objects.tabletop import KINDS, TEST_SEEDS, TEXTURES
 from probnerf.prior.checkpoint import load_prior
 from probnerf.rendering.occupancy import coarsen
@@ -60,7 +60,7 @@ def scenes(condition: str, count: int) -> Iterator[VesselView]:
     cartons = carton_seeds(TEST_SEEDS)
     found = 0
     for seed in TEST_SEEDS:
-        shape = Placed(seed, 0.0, 0.0, 0.0).shape
+        shape = PlacedObject(seed, 0.0, 0.0, 0.0).shape
         if found == count:
             return
         if KINDS[int(shape.kind)] != kind or TEXTURES[int(shape.texture)] != texture:
@@ -80,7 +80,7 @@ def _easy(seed: int) -> VesselPicture:
     config = ViewConfig(elevation=(30.0, 50.0))
     placed, T = place(seed, np.random.default_rng([seed, 41]), config)
     camera = simulated_camera(config)
-    return VesselPicture(placed, camera, T, render(Scene((placed,)), camera, T))
+    return VesselPicture(placed, camera, T, render(TableScene((placed,)), camera, T))
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from benchmarks.rivals.methods import CONTROLLER, FROM_PRIOR, METHODS, Question,
 from benchmarks.scenes.conditions import BEHIND, views
 from benchmarks.scenes.vessels import GRID, base_rate
 from perception.inference.settings import ControllerConfig
-from perception.simulation.simulated_camera import Placed
+from perception.simulation.simulated_camera import PlacedObject
 from probnerf.fields.base import Model
 from probnerf.inference import likelihood_settings
 from probnerf.prior.checkpoint import Prior, load_prior
@@ -152,7 +152,7 @@ def _measure(options: Options, prior: Prior, results: Results) -> None:
                 "object": number,
                 "p": round(p, 5),
                 "shapes": len(found.weights),
-                "handle": bool(Placed(number, 0.0, 0.0, 0.0).shape.has_handle),
+                "handle": bool(PlacedObject(number, 0.0, 0.0, 0.0).shape.has_handle),
                 "hidden_nll": round(float(score(view, found, rate, boxes, rng).values["hidden_nll"]), 5),
                 "point_gradients": float(f"{sampled.point_gradients:.4g}"),
                 "result": found.result,

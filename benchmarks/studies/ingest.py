@@ -35,7 +35,7 @@ from perception.inference.tracker import Tracker
 from perception.inference.warm_up import warm_up
 from perception.observation.segmentation import segment
 from perception.sources.frame import Frame
-from perception.sources.reader import Counts, Reader
+from perception.sources.reader import Reader, ReaderCounts
 from perception.sources.recorder import Recorder
 from probnerf.prior.checkpoint import load_prior
 
@@ -75,7 +75,7 @@ class SyntheticCamera:
 class Taken:
     """When the two consumers got their frames."""
 
-    counts: Counts
+    counts: ReaderCounts
     due: int
     missed: int
     recorded: int

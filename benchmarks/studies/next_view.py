@@ -33,7 +33,7 @@ from perception.inference.settings import ControllerConfig
 from perception.inference.tracker import Tracker
 from perception.observation.segmentation import segment
 from perception.simulation.sensor_faults import sense
-from perception.simulation.simulated_camera import Scene, render
+from perception.simulation.simulated_camera import TableScene, render
 from probnerf.objects.tabletop import TEST_SEEDS
 from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.rendering.occupancy import coarsen, voxel_centres
@@ -61,7 +61,7 @@ def second_answer(
 ) -> tuple[Hypotheses, str]:
     """The answer from both pictures, and what the second was taken for; `tracker` stays as it is."""
     T_world_camera = picture.T_world_camera @ view.cube.T_camera_object @ T_object_camera
-    scene = Scene((picture.placed,))
+    scene = TableScene((picture.placed,))
     frame = sense(render(scene, picture.camera, T_world_camera), picture.camera, T_world_camera, seed)
     own = replace(tracker, _tracks=dict(tracker._tracks), _names=set(tracker._names))
     found = own.update(frame, segment(frame, 1)[0], stages=STAGES)

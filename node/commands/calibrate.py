@@ -10,7 +10,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 
 from calibration.boards import DEFAULT_BOARD, Board, parse_board
-from calibration.calibrate import CalibrateConfig, Calibration, View, calibrate, distinct, motion
+from calibration.calibrate import BoardView, CalibrateConfig, Calibration, calibrate, distinct, motion
 from calibration.camera import Camera
 from calibration.camera_file import read_camera, write_camera
 from calibration.coverage import Coverage, coverage, next_views
@@ -29,7 +29,7 @@ class Found:
     """What a search for the board has found until now."""
 
     size: tuple[int, int] | None = None  # width and height of the pictures, px
-    views: list[View] = field(default_factory=list)
+    views: list[BoardView] = field(default_factory=list)
     unseen: list[str] = field(default_factory=list)  # pictures without the board
     alike: int = 0  # views of a stream that were passed over, as they add nothing
 
@@ -133,7 +133,7 @@ def _look(
     if corners is None:
         found.unseen.append(picture.name)
         return
-    view = View(picture.name, *corners)
+    view = BoardView(picture.name, *corners)
     if stream is not None:
         assert found.size is not None
         least = stream.stream_motion * float(np.hypot(*found.size))

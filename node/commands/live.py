@@ -19,7 +19,7 @@ from node.ros.bus import Bus
 from node.ros.messages import HYPOTHESES, definition, encode, hypotheses_message
 from node.ros.parameters import flat, serve_parameters
 from node.ros.publishers import Announcer
-from node.ros.scene_messages import Level, Status
+from node.ros.scene_messages import DiagnosticStatus, Level
 from node.ros.services import Answers
 from node.ros.topic_source import TopicSource
 from perception.answers.hypotheses import Hypotheses
@@ -74,7 +74,7 @@ def live(config: LiveConfig, out: Console, err: Console) -> None:
             warm_up(tracker)  # before the first frame: its stalls would hold up the reader
         stack.enter_context(reader)
         keeper.thread.start()
-        node = Node(config, tracker, announcer, reader, keeper, recorder, err)
+        node = LiveNode(config, tracker, announcer, reader, keeper, recorder, err)
         node.answers.serve(bus)
         serve_parameters(bus, flat(config))
         if page is not None:
@@ -152,7 +152,7 @@ class _Keeper:
                 self._trouble(str(error))
 
 
-class Node:
+class LiveNode:
     """Infers from the newest frame, and tells everybody what is known."""
 
     def __init__(
@@ -292,12 +292,12 @@ class Node:
         values: dict[str, object] = {"received": counts.received, "rate_hz": round(counts.rate, 2)}
         values |= {f"dropped for {name}": n for name, n in counts.dropped.items()}
         message = counts.error or (counts.notes[-1] if counts.notes else "frames come")
-        statuses = [Status("farside: camera", level, message, values)]
+        statuses = [DiagnosticStatus("farside: camera", level, message, values)]
         if self.recorder is not None:
             r = self.recorder
             recorded = {"frames": r.frames, "dropped": r.dropped, "bytes": r.bytes}
             statuses.append(
-                Status("farside: recording", "error" if r.error else "ok", r.error or "recording", recorded)
+                DiagnosticStatus("farside: recording", "error" if r.error else "ok", r.error or "recording", recorded)
             )
         self.announcer.status(list(self._scene.values()), statuses)
 

@@ -18,9 +18,9 @@ import zenoh
 import zenoh.ext
 
 from foundation.one_line import one_line
-from node.ros.message_counts import Counts, Rate
+from node.ros.message_counts import MessageCounts, Rate
 from node.ros.messages import decode, encode, make, type_hash
-from node.ros.rmw_zenoh import Node, attachment, gid, key, quality, read_attachment
+from node.ros.rmw_zenoh import RosNode, attachment, gid, key, quality, read_attachment
 from node.ros.settings import BusConfig
 
 _HEARTBEAT_S = 0.5  # by which a late joiner notices that it missed a latched sample; as rmw_zenoh_cpp has it
@@ -36,7 +36,7 @@ class Publisher:
     latched: bool
     _publisher: Any
     _source: bytes
-    _counts: Counts
+    _counts: MessageCounts
     _rate: Rate
     _max_bytes: int
     _sequence: int = 0
@@ -48,7 +48,7 @@ class Publisher:
         return self.latched or bool(self._publisher.matching_status.matching)
 
     def publish(self, message: Any) -> bool:
-        """Send a message to whoever listens now; it never waits for them. False where it was not sent (see Counts).
+        """Send a message to whoever listens now; it never waits for them. False where it was not sent (`counts`).
 
         Raises ValueError where the message is of another type, or a field does not fit it.
         """
@@ -83,7 +83,7 @@ class Bus:
 
     def __init__(self, config: BusConfig | None = None, say: Callable[[str], None] | None = None) -> None:
         self.config = config or BusConfig()
-        self.counts = Counts(say or (lambda line: print(f"farside: {line}", file=sys.stderr)))
+        self.counts = MessageCounts(say or (lambda line: print(f"farside: {line}", file=sys.stderr)))
         self._entities = 0
         self._tokens: list[str] = []  # our own, which a router does not tell us
         self._threads: list[threading.Thread] = []
@@ -95,7 +95,7 @@ class Bus:
         c = self.config
         with ExitStack() as stack:
             self._session = stack.enter_context(_open(c))
-            self.node = Node(c.domain_id, str(self._session.zid()), c.namespace, c.name)
+            self.node = RosNode(c.domain_id, str(self._session.zid()), c.namespace, c.name)
             self._stack = stack.pop_all()
         self._declare(self.node.token(0, "NN"))
         return self

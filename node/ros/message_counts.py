@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 
 
-class Counts:
+class MessageCounts:
     """How many messages met which fate, by topic or service: sent, received, dropped, too_large, too_fast, malformed,
     failed. The first trouble of each kind is said in a line."""
 

@@ -7,7 +7,7 @@ from calibration.camera import Camera
 from node.ros.bus import Bus, Publisher
 from node.ros.messages import HYPOTHESES, frame_messages, hypotheses_message
 from node.ros.scene_messages import (
-    Status,
+    DiagnosticStatus,
     counts_status,
     diagnostics_message,
     markers_message,
@@ -67,7 +67,7 @@ class Announcer:
             if publisher.wanted:
                 publisher.publish(build())
 
-    def status(self, objects: Sequence[Hypotheses], others: Sequence[Status] = ()) -> None:
+    def status(self, objects: Sequence[Hypotheses], others: Sequence[DiagnosticStatus] = ()) -> None:
         """Publish /diagnostics: the sampler's word on each object, the bus's counts, and `others` (camera, rates)."""
         now = time.time_ns()
         statuses = [*others, *(sampler_status(h, now) for h in objects), counts_status(self._bus.counts.all())]

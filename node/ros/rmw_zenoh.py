@@ -12,8 +12,8 @@ _DEFAULT_DEPTH = 42  # of rmw_zenoh_cpp's default quality of service, which is l
 
 
 @dataclass(frozen=True)
-class Node:
-    """Who speaks."""
+class RosNode:
+    """A node's name and the session that it speaks in."""
 
     domain: int
     zid: str  # of the session

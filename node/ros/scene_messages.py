@@ -158,7 +158,7 @@ Level = Literal["ok", "warn", "error", "stale"]
 
 
 @dataclass(frozen=True)
-class Status:
+class DiagnosticStatus:
     """One line of /diagnostics."""
 
     name: str  # such as "farside: camera"
@@ -168,7 +168,7 @@ class Status:
     hardware_id: str = ""
 
 
-def diagnostics_message(stamp_ns: int, statuses: Sequence[Status]) -> Any:
+def diagnostics_message(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> Any:
     """A diagnostic_msgs/DiagnosticArray."""
     levels = ("ok", "warn", "error", "stale")
     return make(
@@ -191,21 +191,21 @@ def diagnostics_message(stamp_ns: int, statuses: Sequence[Status]) -> Any:
     )
 
 
-def sampler_status(h: Hypotheses, now_ns: int) -> Status:
+def sampler_status(h: Hypotheses, now_ns: int) -> DiagnosticStatus:
     """What the sampler says of one object."""
     message = h.result if not h.out_of_model else f"{h.result}; {unexplained(h)}"
     age = (now_ns - h.stamp_ns) * 1e-9
     values = {"age (s)": age, "stage": h.stage, "monte carlo error": h.monte_carlo_error}
     values |= {"effective hypotheses": h.effective_hypotheses, **h.diagnostics}
-    return Status(f"farside: object {h.object_id}", "warn" if h.out_of_model else "ok", message, values)
+    return DiagnosticStatus(f"farside: object {h.object_id}", "warn" if h.out_of_model else "ok", message, values)
 
 
-def counts_status(counts: Mapping[str, Mapping[str, int]]) -> Status:
+def counts_status(counts: Mapping[str, Mapping[str, int]]) -> DiagnosticStatus:
     """What the bus sent, took and left out, by topic or service."""
     values = {f"{name} {fate}": n for name, fates in sorted(counts.items()) for fate, n in sorted(fates.items())}
     trouble = sum(n for fates in counts.values() for fate, n in fates.items() if fate not in ("sent", "received"))
     message = f"{trouble} messages dropped or refused" if trouble else "all messages passed"
-    return Status("farside: bus", "warn" if trouble else "ok", message, values)
+    return DiagnosticStatus("farside: bus", "warn" if trouble else "ok", message, values)
 
 
 def transforms_message(scene: Sequence[Hypotheses], node: str) -> Any:

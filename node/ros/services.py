@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -14,28 +13,12 @@ from node.ros.scene_messages import object_frame_id
 from perception.answers.hypotheses import FrameName, Hypotheses
 from perception.answers.query import query
 from perception.answers.regions import Box, Points, Region, Swept
+from perception.answers.scene import Scene
 
 BOX, POINTS, SWEPT = 0, 1, 2  # kinds of a QueryRegion request
 MAX_BOXES = 256
 RING = 5  # poses about the object, where a request names no number
 MAX_VIEWS = 100
-
-
-@dataclass(frozen=True)
-class Scene:
-    """The hypotheses of one picture's objects, as one."""
-
-    objects: tuple[Hypotheses, ...]  # at least one
-
-    @property
-    def stamp_ns(self) -> int:
-        """Of the (oldest) picture."""
-        return min(h.stamp_ns for h in self.objects)
-
-    @property
-    def stage(self) -> int:
-        """The least of the objects'."""
-        return min(h.stage for h in self.objects)
 
 
 class Answers:
@@ -107,7 +90,7 @@ class Answers:
         return make(
             f"{NEXT_VIEW}_Response",
             success=True,
-            **_about(scene, (time.time_ns() - scene.stamp_ns) * 1e-9),
+            **_about(scene, (time.time_ns() - min(h.stamp_ns for h in scene)) * 1e-9),
             poses=[pose(T_frame_object @ T) for T in ranked.T_object_camera],
             gain_nats=np.asarray(ranked.gain_nats, np.float64),
         )
@@ -117,10 +100,7 @@ class Answers:
         scene = self.scene
         if not request.object_id:
             return scene
-        if chosen := tuple(h for h in scene.objects if h.object_id == request.object_id):
-            return Scene(chosen)
-        known = ", ".join(str(h.object_id) for h in scene.objects)
-        raise ValueError(f"there is no object {request.object_id}; there are {known} (0: all together)")
+        return Scene((scene.by_id(request.object_id),))
 
     def _frame(self, name: str, objects: Sequence[Hypotheses]) -> FrameName:
         """Which of our frames a request means by a frame_id. Raises ValueError for another one, and for an object's
@@ -140,7 +120,8 @@ class Answers:
 
 
 def _about(scene: Scene, age_s: float) -> dict[str, Any]:
-    return {"stamp": time_message(scene.stamp_ns), "stage": scene.stage, "age": age_s}
+    """Of the oldest picture, and of the object that was sampled least."""
+    return {"stamp": time_message(min(h.stamp_ns for h in scene)), "stage": min(h.stage for h in scene), "age": age_s}
 
 
 def _region(request: Any) -> Region:

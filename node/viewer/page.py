@@ -17,7 +17,7 @@ from viser.transforms import SO3
 from node.figures import voxel_renderer
 from node.viewer import panel, scene3d
 from node.viewer.page_guard import GuardedServer
-from node.viewer.scene3d import CameraView, Placed
+from node.viewer.scene3d import CameraView, PageScene
 from perception.answers.hypotheses import Hypotheses
 from probnerf.types import BASE_Z
 
@@ -34,7 +34,7 @@ class Page:
         """
         self._server = GuardedServer(port, token)
         self._lock = threading.RLock()  # held while the scene is read or replaced
-        self._placed: Placed | None = None
+        self._placed: PageScene | None = None
         self._view: CameraView | None = None
         self._cloud: scene3d.Cloud | None = None
         self._ranks: dict[int, int] = {}  # object id: which hypothesis is shown, 0 the heaviest
@@ -193,7 +193,7 @@ class Page:
         for side, metres in zip(self._sides, size, strict=True):
             side.value = round(1e3 * float(metres))
 
-    def _look(self, placed: Placed) -> None:
+    def _look(self, placed: PageScene) -> None:
         """Stand where both sides of the objects are in sight."""
         position, at = scene3d.onlooker(placed)
         self._server.scene.set_up_direction(placed.up)
@@ -283,7 +283,7 @@ class Page:
         )
         self._scale.content = panel.scale(ramp, *words)
 
-    def _rank_views(self, scene: list[Hypotheses], placed: Placed, shown: int) -> None:
+    def _rank_views(self, scene: list[Hypotheses], placed: PageScene, shown: int) -> None:
         """Suggested next views, found in the background: it takes longer than to show the rest."""
         from perception.answers.next_view import rank_views
 

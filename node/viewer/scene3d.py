@@ -42,7 +42,7 @@ class CameraView:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PageScene:
     """A scene in the page's frame, ready to be asked in it."""
 
     objects: tuple[Hypotheses, ...]
@@ -108,24 +108,24 @@ def _by_place(frame: Frame, segments: Sequence[Segment], scene: Sequence[Hypothe
     return {name: replace(segments[i], id=name) for name, i in chosen.items()}
 
 
-def place(scene: Sequence[Hypotheses]) -> Placed:
+def place(scene: Sequence[Hypotheses]) -> PageScene:
     """The scene in the page's frame. Raises ValueError for an empty scene, or objects of different frames."""
     if not scene:
         raise ValueError("there is no object to show; give at least one object's hypotheses")
     first = scene[0]
     T_object_camera = np.linalg.inv(first.object_frame.T_camera_object)
     if all(h.T_world_camera is not None for h in scene):
-        placed = Placed(tuple(scene), "world", "world", np.asarray(first.T_world_camera))
+        placed = PageScene(tuple(scene), "world", "world", np.asarray(first.T_world_camera))
     elif len(scene) == 1:
-        placed = Placed((first,), "object", f"object {first.object_id}", T_object_camera)
+        placed = PageScene((first,), "object", f"object {first.object_id}", T_object_camera)
     else:  # the first object's frame is made the world, because only there may several objects be asked at once
         moved = tuple(replace(h, T_world_camera=T_object_camera) for h in scene)
-        placed = Placed(moved, "world", f"object {first.object_id}", T_object_camera)
+        placed = PageScene(moved, "world", f"object {first.object_id}", T_object_camera)
     ask(placed, np.zeros(3), np.full(3, 1e-3))  # raises where the objects do not go together
     return placed
 
 
-def ask(placed: Placed, centre: Float[np.ndarray, "3"], size: Float[np.ndarray, "3"]) -> QueryResult:
+def ask(placed: PageScene, centre: Float[np.ndarray, "3"], size: Float[np.ndarray, "3"]) -> QueryResult:
     """What all objects together say of an axis-aligned box of the page's frame (m)."""
     centre, size = np.asarray(centre, np.float64), np.asarray(size, np.float64)
     low, high = (tuple(float(v) for v in centre + side * size) for side in (-0.5, 0.5))
@@ -152,7 +152,7 @@ def weights_in_order(h: Hypotheses) -> tuple[Int[np.ndarray, "n"], Float[np.ndar
     return order, np.bincount(h.twins, weights=h.weights, minlength=len(h.weights))[order]
 
 
-def shape(placed: Placed, h: Hypotheses, index: int) -> Shape:
+def shape(placed: PageScene, h: Hypotheses, index: int) -> Shape:
     """The surface of hypothesis `index`. A triangle is seen where space just in front of it was."""
     vertices, faces = mesh(h, index)
     corners = vertices[faces]  # [f, 3, 3]
@@ -179,7 +179,7 @@ class Cloud:
         return binary_entropy(self.p_occupied) / np.log(2.0)
 
 
-def cloud(placed: Placed) -> Cloud:
+def cloud(placed: PageScene) -> Cloud:
     """The unseen space of all objects."""
     points = []
     for h in placed.objects:
@@ -191,7 +191,7 @@ def cloud(placed: Placed) -> Cloud:
     return Cloud(where[keep], p[keep], min(h.voxel_m for h in placed.objects))
 
 
-def first_box(placed: Placed, unseen: Cloud) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+def first_box(placed: PageScene, unseen: Cloud) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Centre and size (m) of a box where the answer is worth reading: the surroundings of space that hypotheses are
     split about, at about even odds. Rounded to millimetres.
     """
@@ -206,7 +206,7 @@ def first_box(placed: Placed, unseen: Cloud) -> tuple[Float[np.ndarray, "3"], Fl
     return tried[best], size
 
 
-def seen_surface(placed: Placed, view: CameraView) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+def seen_surface(placed: PageScene, view: CameraView) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
     """The points that the depth measured around the objects (m), with their colours: none without depth."""
     if view.frame.depth is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
@@ -238,7 +238,7 @@ def field_of_view(frame: Frame) -> tuple[float, float]:
     return float(2.0 * np.arctan(0.5 * height / fy)), float(width / fx / (height / fy))
 
 
-def onlooker(placed: Placed) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+def onlooker(placed: PageScene) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Where to look from and at (m): beside the objects and a little behind, so that both sides are in sight."""
     frames = [placed.T_page_object(h) for h in placed.objects]
     middle = np.mean([T[:3, 3] for T in frames], axis=0)

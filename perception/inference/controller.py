@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array
 
 from perception.answers.hypotheses import Hypotheses
-from perception.inference.publish import View, published
+from perception.inference.publish import ConditionedView, published
 from perception.inference.settings import ControllerConfig
 from perception.observation.encoder_crop import crop
 from perception.observation.object_frame import ObjectFrame
@@ -34,7 +34,7 @@ from probnerf.inference import asks_encoder, crossings_of, encoder_guess, infer,
 from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.checkpoint import Prior
 from probnerf.prior.networks import ProbNeRF
-from probnerf.prior.posterior_network import Picture
+from probnerf.prior.posterior_network import EncoderPicture
 from probnerf.sampling.gaussian_mixture import GaussianMixture
 from probnerf.sampling.hmc import StageInfo
 from probnerf.sampling.populations import pooled
@@ -82,7 +82,7 @@ def estimate(
     config = config or ControllerConfig()
     begun = time.monotonic()
     observation, cube = observe(frame, segment, config.observe, seed, known)
-    view = View(frame, segment, observation, cube, seen_voxels(frame, segment, cube, config.grid))
+    view = ConditionedView(frame, segment, observation, cube, seen_voxels(frame, segment, cube, config.grid))
     return infer_view(
         view,
         prior,
@@ -97,7 +97,7 @@ def estimate(
 
 
 def infer_view(
-    view: View,
+    view: ConditionedView,
     prior: Prior,
     config: ControllerConfig,
     *,
@@ -168,7 +168,7 @@ def infer_view(
 class _Work:
     """One view's sampling: what all runs share, and what they have cost."""
 
-    view: View
+    view: ConditionedView
     prior: Prior
     config: ControllerConfig
     seed: int
@@ -202,7 +202,7 @@ class _Work:
         return sampler_of(self.config.infer, self.reference, self.before)
 
     @cached_property
-    def picture(self) -> Picture | None:
+    def picture(self) -> EncoderPicture | None:
         """What the encoder sees. Without the ranges that it was trained with there is none, nor where the pose is known
         (guesses at one yaw climb to poor modes): sampling begins at the prior.
         """

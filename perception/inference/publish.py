@@ -22,7 +22,7 @@ from probnerf.types import Observation, Posterior
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ConditionedView:
     """What is conditioned on, and the frame that the answer is given in: the newest one."""
 
     frame: Frame
@@ -33,7 +33,7 @@ class View:
 
 
 def published(
-    view: View,
+    view: ConditionedView,
     posterior: Posterior,
     likelihood: Likelihood,
     prior: Prior,

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 
 from perception.answers.hypotheses import Hypotheses
 from perception.inference.controller import infer_view
-from perception.inference.publish import View
+from perception.inference.publish import ConditionedView
 from perception.inference.settings import ControllerConfig, TrackConfig
 from perception.observation.object_frame import ObjectFrame, object_frame
 from perception.observation.rays import observe
@@ -76,7 +76,7 @@ class Look:
     agreement: float
     hypotheses: Hypotheses | None  # what is known of it already, under this frame's stamp; None: nothing that holds
     seed: int
-    _view: View  # to condition on
+    _view: ConditionedView  # to condition on
     _kept: tuple[_Kept, ...]
     _track: _Track | None  # that is gone on from
 
@@ -128,10 +128,12 @@ class Tracker:
             agreement = self._agreement(track.posterior, observation)
             still = frame.T_world_camera is not None or _same_plane(cube.plane, found.plane, self.track)
             if still and agreement >= self.track.moved_below:
-                return self._go_on(name, track, View(frame, segment, observation, cube, track.seen), agreement, seed)
+                return self._go_on(
+                    name, track, ConditionedView(frame, segment, observation, cube, track.seen), agreement, seed
+                )
             change = "moved"
         observation, _ = observe(frame, segment, self.config.observe, seed, found)
-        view = View(frame, segment, observation, found, seen_voxels(frame, segment, found, self.config.grid))
+        view = ConditionedView(frame, segment, observation, found, seen_voxels(frame, segment, found, self.config.grid))
         return Look(name, change, agreement, None, seed, view, (_Kept(observation, _direction(found)),), None)
 
     def infer(
@@ -194,7 +196,7 @@ class Tracker:
         self._names.add(name)
         return name
 
-    def _go_on(self, name: int, track: _Track, view: View, agreement: float, seed: int) -> Look:
+    def _go_on(self, name: int, track: _Track, view: ConditionedView, agreement: float, seed: int) -> Look:
         """The look at an object that stands where it stood."""
         seen = seen_voxels(view.frame, view.segment, view.object_frame, self.config.grid)
         hidden = above_plane(self.config.grid) & ~track.seen

@@ -7,11 +7,11 @@ from perception.observation.segmentation import Segment
 from perception.sources.frame import Frame
 from probnerf.geometry import look_at, pinhole_rays
 from probnerf.prior.encoder_input import ENCODER_RADIUS
-from probnerf.prior.posterior_network import Picture
+from probnerf.prior.posterior_network import EncoderPicture
 from probnerf.types import OBJECT, UNKNOWN, on_device
 
 
-def crop(frame: Frame, segment: Segment, cube: ObjectFrame, size: int) -> Picture:
+def crop(frame: Frame, segment: Segment, cube: ObjectFrame, size: int) -> EncoderPicture:
     """The encoder's picture: the frame as seen by a camera at the same place that looks at the cube's centre.
 
     A rotation of the camera moves no parallax, so this is a look-up: each pixel takes the nearest one of the frame.
@@ -31,7 +31,7 @@ def crop(frame: Frame, segment: Segment, cube: ObjectFrame, size: int) -> Pictur
     z = frame.depth[v, u]
     range_cube = np.where(np.isfinite(z), z, 0.0) / np.maximum(rays[:, 2], 1e-6) / cube.half_extent
     is_object = status == OBJECT
-    return Picture(
+    return EncoderPicture(
         rgb=on_device((frame.rgb[v, u] / 255.0).reshape(size, size, 3)),
         distance=on_device(np.where(is_object, np.where(np.isfinite(z), range_cube, -1.0), 0.0).reshape(size, size)),
         unknown=on_device((status == UNKNOWN).reshape(size, size)),

@@ -12,16 +12,16 @@ import numpy as np
 
 from calibration.camera import Camera
 from perception.simulation.sensor_faults import SensorConfig, sense
-from perception.simulation.simulated_camera import Placed, Scene, place_camera, render
+from perception.simulation.simulated_camera import PlacedObject, TableScene, place_camera, render
 from perception.sources.frame import Frame
 from perception.sources.recorder import write_log
 from perception.sources.settings import SHIPPED_LOG
 
 CAMERA = Camera(640, 480, np.array([[612.0, 0.0, 322.4], [0.0, 612.0, 238.7], [0.0, 0.0, 1.0]]), np.zeros(5))
 T_WORLD_CAMERA = place_camera((0.46, 0.0, 0.29), (0.0, 0.01, 0.03))
-MUG = Placed(seed=2_900_727, x=-0.02, y=0.0, yaw=np.deg2rad(172.0))  # test seeds: no prior was trained on these
-CARTON = Placed(seed=2_900_483, x=0.068, y=0.034, yaw=np.deg2rad(25.0))
-SCENE = Scene((MUG, CARTON))
+MUG = PlacedObject(seed=2_900_727, x=-0.02, y=0.0, yaw=np.deg2rad(172.0))  # test seeds: no prior was trained on these
+CARTON = PlacedObject(seed=2_900_483, x=0.068, y=0.034, yaw=np.deg2rad(25.0))
+SCENE = TableScene((MUG, CARTON))
 SENSOR = SensorConfig(colour_noise=0.002, max_range=1.6)  # little noise and no wall: the file stays small
 START_NS, STEP_NS, FRAMES = 1_790_000_000_000_000_000, 100_000_000, 5
 

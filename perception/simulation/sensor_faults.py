@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from calibration.camera import Camera
-from perception.simulation.simulated_camera import _SUB, Picture, Scene, render
+from perception.simulation.simulated_camera import _SUB, FaultlessImage, TableScene, render
 from perception.sources.frame import Frame
 
 
@@ -30,7 +30,7 @@ class SensorConfig:
 
 
 def simulate(
-    scene: Scene,
+    scene: TableScene,
     camera: Camera,
     T_world_camera: Float[np.ndarray, "4 4"],
     seed: int,
@@ -42,7 +42,7 @@ def simulate(
 
 
 def sense(
-    picture: Picture,
+    picture: FaultlessImage,
     camera: Camera,
     T_world_camera: Float[np.ndarray, "4 4"] | None,
     seed: int,

@@ -23,7 +23,7 @@ _FLOOR, _WALL = -0.75, -1.6  # m: the room's floor (z) and the wall behind the t
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PlacedObject:
     """One object of the family on the table."""
 
     seed: int  # of the family
@@ -51,10 +51,10 @@ class Placed:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class TableScene:
     """A table in a room. Object i of the list has id i + 1 in the label map."""
 
-    objects: tuple[Placed, ...]
+    objects: tuple[PlacedObject, ...]
     table: tuple[float, float] = (0.45, 0.7)  # m, half sides along x and y
     table_colour: tuple[float, float, float] = (0.62, 0.47, 0.33)
     wall_colour: tuple[float, float, float] = (0.72, 0.74, 0.75)
@@ -62,7 +62,7 @@ class Scene:
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class FaultlessImage:
     """What a faultless camera sees."""
 
     rgb: Float[np.ndarray, "h w 3"]  # in [0, 1]
@@ -77,12 +77,12 @@ def place_camera(position: tuple[float, float, float], target: tuple[float, floa
     return look_at(np.asarray(position, float), np.asarray(target, float))
 
 
-def truth(scene: Scene, T_world_camera: Float[np.ndarray, "4 4"]) -> list[Float[np.ndarray, "4 4"]]:
+def truth(scene: TableScene, T_world_camera: Float[np.ndarray, "4 4"]) -> list[Float[np.ndarray, "4 4"]]:
     """T_camera_object of each object's canonical frame, metres."""
     return [np.linalg.inv(T_world_camera) @ placed.T_world_object for placed in scene.objects]
 
 
-def render(scene: Scene, camera: Camera, T_world_camera: Float[np.ndarray, "4 4"]) -> Picture:
+def render(scene: TableScene, camera: Camera, T_world_camera: Float[np.ndarray, "4 4"]) -> FaultlessImage:
     """The scene through a faultless camera: four rays per pixel, and one through its centre for depth and label."""
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     offsets = (np.arange(_SUB) + 0.5) / _SUB - 0.5
@@ -98,7 +98,7 @@ def render(scene: Scene, camera: Camera, T_world_camera: Float[np.ndarray, "4 4"
             colours.append(rgb)
     shape = u.shape
     nearest, farthest = np.min(depths, axis=0), np.max(depths, axis=0)
-    return Picture(
+    return FaultlessImage(
         rgb=np.mean(colours, axis=0).reshape(*shape, 3),
         depth=depths[0].reshape(shape),
         nearest=nearest.reshape(shape),
@@ -108,7 +108,7 @@ def render(scene: Scene, camera: Camera, T_world_camera: Float[np.ndarray, "4 4"
 
 
 def _shoot(
-    scene: Scene, T_world_camera: Float[np.ndarray, "4 4"], rays: Float[np.ndarray, "n 3"]
+    scene: TableScene, T_world_camera: Float[np.ndarray, "4 4"], rays: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Int32[np.ndarray, "n"]]:
     """Colour, distance along the ray (m, inf: nothing) and object id of unit rays in the camera frame."""
     origin, directions = T_world_camera[:3, 3], rays @ T_world_camera[:3, :3].T
@@ -147,7 +147,7 @@ def _meets_box(
 
 
 def _surroundings(
-    scene: Scene, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
+    scene: TableScene, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
     """Colour and distance (m) of the table, the floor or the wall behind."""
 

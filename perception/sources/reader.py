@@ -21,7 +21,7 @@ Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
-class Counts:
+class ReaderCounts:
     """What a `Reader` has seen until now."""
 
     received: int  # frames
@@ -101,7 +101,7 @@ class Reader:
         """Nothing more will come."""
         return self._ended or self._closed
 
-    def counts(self) -> Counts:
+    def counts(self) -> ReaderCounts:
         """What was seen until now; from any thread."""
         with self._changed:
             rate = 0.0
@@ -109,7 +109,7 @@ class Reader:
                 between = (self._arrivals[-1] - self._arrivals[0]) / (len(self._arrivals) - 1)
                 late = time.monotonic() - self._arrivals[-1]
                 rate = 1.0 / max(between, late / 2.0, 1e-9)  # one frame that is a little late is no silence
-            return Counts(
+            return ReaderCounts(
                 self._received,
                 rate,
                 {"newest": self._replaced} | {listener.name: listener.dropped for listener in self._listeners},

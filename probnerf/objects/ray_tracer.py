@@ -28,7 +28,7 @@ _CORNERS = np.array([[1, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]], np.float
 _SEAM = 2e-6  # neighbouring edges overlap by this, so that no ray slips between them
 
 
-class View(eqx.Module):
+class RenderedView(eqx.Module):
     """Square pictures of one object (or, with leading axes, of several)."""
 
     rgb: Float[Array, "size size 3"]  # in [0, 1], white where there is no object
@@ -155,12 +155,12 @@ def trace_batch(
 
 def render_views(
     objects: TabletopObject, T_object_camera: Float[np.ndarray, "b 4 4"], focal_px: float, size: int
-) -> View:
+) -> RenderedView:
     """One picture of each of a stack of objects."""
     rays = [pinhole_rays(T, focal_px, size) for T in np.asarray(T_object_camera)]
     hit, distance, rgb = trace_batch(objects, np.stack([o for o, _ in rays]), np.stack([d for _, d in rays]))
     shape = (len(rays), size, size)
-    return View(rgb=rgb.reshape(*shape, 3), mask=hit.reshape(shape), range=distance.reshape(shape))
+    return RenderedView(rgb=rgb.reshape(*shape, 3), mask=hit.reshape(shape), range=distance.reshape(shape))
 
 
 @partial(jax.jit, static_argnames="grid")

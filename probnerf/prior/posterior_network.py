@@ -15,7 +15,7 @@ from probnerf.prior.networks import ProbNeRF
 from probnerf.types import POSE_SIZE, Pose, on_device
 
 
-class Picture(eqx.Module):
+class EncoderPicture(eqx.Module):
     """What the encoder sees: a square view of the cube by a camera that looks at its centre (view frame)."""
 
     rgb: Float[Array, "s s 3"]  # in [0, 1]
@@ -25,7 +25,7 @@ class Picture(eqx.Module):
     tan_half_fov: Float[Array, ""]
 
 
-def potential_at(model: ProbNeRF, picture: Picture, pose: Pose) -> tuple[Array, Array]:
+def potential_at(model: ProbNeRF, picture: EncoderPicture, pose: Pose) -> tuple[Array, Array]:
     """Mean and precision of q(z | picture) if the object stood at `pose`."""
     T = picture.T_view_camera
     position = pose.to_object(T[:3, 3])
@@ -42,7 +42,7 @@ def even_yaws(count: int) -> Float[np.ndarray, "count"]:
 
 
 def encoder_positions(
-    key: PRNGKeyArray, model: ProbNeRF, picture: Picture, yaws: Float[np.ndarray, "y"], draws: int, spread: float
+    key: PRNGKeyArray, model: ProbNeRF, picture: EncoderPicture, yaws: Float[np.ndarray, "y"], draws: int, spread: float
 ) -> Float[Array, "y_draws d"]:
     """Positions with z = mean + spread N(0, 1 / precision) of the encoder at the given yaws, `draws` at each.
 
@@ -52,7 +52,7 @@ def encoder_positions(
 
 
 def guesses(
-    key: PRNGKeyArray, model: ProbNeRF, picture: Picture, count: int, sample_pose: bool = True
+    key: PRNGKeyArray, model: ProbNeRF, picture: EncoderPicture, count: int, sample_pose: bool = True
 ) -> Float[Array, "count d"]:
     """Where climbs start: the encoder's mean at even yaws; where the pose is known, latents drawn from it there."""
     if sample_pose:
@@ -62,7 +62,7 @@ def guesses(
 
 @program("draws")
 def _encoder_positions(
-    key: PRNGKeyArray, model: ProbNeRF, picture: Picture, yaws: Float[Array, "y"], draws: int, spread: float
+    key: PRNGKeyArray, model: ProbNeRF, picture: EncoderPicture, yaws: Float[Array, "y"], draws: int, spread: float
 ) -> Float[Array, "y_j d"]:
     zero = jnp.zeros(())
     noise = jax.random.normal(key, (len(yaws), draws, model.latent))

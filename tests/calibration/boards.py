@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from calibration.boards import Board, parse_board
-from calibration.calibrate import View
+from calibration.calibrate import BoardView
 from calibration.camera import Camera
 
 K = np.array([[430.0, 0.0, 310.0], [0.0, 432.0, 221.0], [0.0, 0.0, 1.0]])
@@ -39,14 +39,14 @@ def poses(
     return found
 
 
-def views(model: str, count: int = 15, noise: float = 0.1, tilt: float = 40.0, seed: int = 0) -> list[View]:
+def views(model: str, count: int = 15, noise: float = 0.1, tilt: float = 40.0, seed: int = 0) -> list[BoardView]:
     """Exact corners with `noise` (px)."""
     rng = np.random.default_rng(seed + 1000)
     corners = CHESSBOARD.corners
     made = []
     for i, T in enumerate(poses(CAMERAS[model], CHESSBOARD, count, tilt, seed)):
         px = CAMERAS[model].project(corners @ T[:3, :3].T + T[:3, 3])
-        made.append(View(f"view {i}", corners, px + noise * rng.normal(size=px.shape)))
+        made.append(BoardView(f"view {i}", corners, px + noise * rng.normal(size=px.shape)))
     return made
 
 

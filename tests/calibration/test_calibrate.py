@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibration.boards import parse_board
-from calibration.calibrate import CalibrateConfig, View, calibrate, distinct
+from calibration.calibrate import BoardView, CalibrateConfig, calibrate, distinct
 from tests.calibration.boards import CAMERAS, SIZE, views
 
 CONFIG = CalibrateConfig()
@@ -91,7 +91,7 @@ def test_few_and_like_views_are_refused() -> None:
     with pytest.raises(ValueError, match=r"^1 different views of the board are too few .* take 3 or more"):
         calibrate(distinct([one, one, one], SIZE, CONFIG)[0], SIZE)
     rng = np.random.default_rng(0)
-    again = [View(str(i), one.points, one.pixels + 0.3 * rng.normal(size=one.pixels.shape)) for i in range(6)]
+    again = [BoardView(str(i), one.points, one.pixels + 0.3 * rng.normal(size=one.pixels.shape)) for i in range(6)]
     assert "focal length is not determined" in calibrate(again, SIZE).trouble
 
 
@@ -131,7 +131,7 @@ def test_views_of_parts_of_a_board_count() -> None:
     parts = []
     for view in views("plumb_bob", 20):
         chosen = np.sort(rng.permutation(48)[: rng.integers(20, 48)])
-        parts.append(View(view.name, view.points[chosen], view.pixels[chosen]))
+        parts.append(BoardView(view.name, view.points[chosen], view.pixels[chosen]))
     for model in ("plumb_bob", "equidistant"):
         result = calibrate(parts, SIZE, model)
         assert result.trouble is None
@@ -145,7 +145,7 @@ def test_the_real_chessboard(shared_data: Path) -> None:
     for file in sorted((shared_data / "chessboard_wide").glob("*.png")):
         found = board.find(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE))
         assert found is not None
-        seen.append(View(file.name, *found))
+        seen.append(BoardView(file.name, *found))
     kept, _ = distinct(seen, SIZE, CONFIG)
     result = calibrate(kept, SIZE)
     assert len(result.views) == 12 and result.trouble is None

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.calibrate import FittedView, View, calibrate, tilts
+from calibration.calibrate import BoardView, FittedView, calibrate, tilts
 from calibration.coverage import coverage, next_views
 from tests.calibration.boards import CAMERAS, CHESSBOARD, SIZE, views
 
@@ -22,7 +22,7 @@ def placed(
     px = CAMERAS["plumb_bob"].project(points)
     assert right_away <= 0 or points[7, 2] > points[0, 2]  # what the names mean
     assert lower_away <= 0 or points[-1, 2] > points[7, 2]
-    return FittedView(View("view", CHESSBOARD.corners, px), T, np.zeros_like(px))
+    return FittedView(BoardView("view", CHESSBOARD.corners, px), T, np.zeros_like(px))
 
 
 def test_tilts_are_signed_and_do_not_depend_on_how_the_board_is_numbered() -> None:

@@ -23,7 +23,7 @@ def test_it_goes_where_it_is_sent_and_says_so() -> None:
         for angle in (0.0, 90.0, 45.5, -30.0):
             table.move_to(angle)
             assert not grbl.moving and grbl.angle == pytest.approx(angle)
-            assert table.status() == turntable.Status("Idle", pytest.approx(angle))
+            assert table.status() == turntable.TurntableStatus("Idle", pytest.approx(angle))
         assert table.garbage == 0
         moves = [line for line in grbl.received if "G1" in line]
         assert moves[1] == "G21G90G94G1X90.0000F60000.000"

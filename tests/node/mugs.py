@@ -13,20 +13,20 @@ from perception.observation.rays import observe
 from perception.observation.segmentation import Segment
 from perception.observation.visibility import seen_voxels
 from perception.simulation.sensor_faults import simulate
-from perception.simulation.simulated_camera import Placed, Scene, place_camera
+from perception.simulation.simulated_camera import PlacedObject, TableScene, place_camera
 from perception.sources.frame import Frame
 from probnerf.objects.tabletop import signed_distance
 from probnerf.rendering.occupancy import voxel_centres
 from probnerf.types import Pose
 
-MUG = Placed(2_900_727, 0.0, -0.06, np.pi)
-CARTON = Placed(2_900_483, 0.0, 0.09, 0.3)
+MUG = PlacedObject(2_900_727, 0.0, -0.06, np.pi)
+CARTON = PlacedObject(2_900_483, 0.0, 0.09, 0.3)
 CAMERA = Camera(240, 180, np.array([[230.0, 0, 120], [0, 230.0, 90], [0, 0, 1]]), np.zeros(5))
 
 
 def table_frame() -> Frame:
     """A mug (label 1) and a carton (label 2) on a table."""
-    return simulate(Scene((MUG, CARTON)), CAMERA, place_camera((0.42, 0.0, 0.3), (0.0, 0.0, 0.03)), seed=0)
+    return simulate(TableScene((MUG, CARTON)), CAMERA, place_camera((0.42, 0.0, 0.3), (0.0, 0.0, 0.03)), seed=0)
 
 
 def write_folder(folder: Path, frame: Frame, **changes: np.ndarray) -> Path:

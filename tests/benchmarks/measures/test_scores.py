@@ -10,7 +10,7 @@ from benchmarks.rivals.methods import Question, weighted_posterior
 from benchmarks.rivals.quick import METHODS, POSTERIOR
 from benchmarks.scenes.vessels import GRID
 from benchmarks.studies.hidden import judge
-from perception.inference.publish import View, published
+from perception.inference.publish import ConditionedView, published
 from perception.inference.settings import ControllerConfig
 from perception.observation.visibility import answered_voxels, seen_voxels
 from probnerf.prior.checkpoint import load_prior
@@ -59,7 +59,7 @@ def test_shapes_are_those_that_are_published(vessel):
     posterior = weighted_posterior(positions, np.ones(8), 0.0)
     config = question.config
     seen = seen_voxels(vessel.frame, vessel.segment, cube, config.grid)
-    view = View(vessel.frame, vessel.segment, observation, cube, seen)
+    view = ConditionedView(vessel.frame, vessel.segment, observation, cube, seen)
     h = published(view, posterior, likelihood, question.prior, config, 0, {})
     assert len(h.weights) == 8  # all of them, in their order
     asked = jnp.asarray(answered_voxels(vessel.frame, vessel.segment, cube, config.grid))

@@ -12,7 +12,7 @@ import pytest
 from benchmarks.measures.scores import Answer
 from benchmarks.studies import handle
 from benchmarks.studies.handle import FROM_PRIOR, OWN, PRIOR, REACH, Options, has_handle, log_score, main, reach
-from perception.simulation.simulated_camera import Placed
+from perception.simulation.simulated_camera import PlacedObject
 from probnerf.objects.tabletop import TEST_SEEDS, TRAIN_SEEDS, signed_distance
 from probnerf.objects.tabletop_sampler import MUG, PITCHER
 from probnerf.prior.checkpoint import load_prior
@@ -23,7 +23,7 @@ def test_of_the_family_s_shapes_those_with_a_handle_are_told_from_those_without(
     points = voxel_centres(32).reshape(-1, 3).astype(np.float32)
     found: dict[bool, list[float]] = {False: [], True: []}
     for seed in TRAIN_SEEDS[:50]:
-        shape = Placed(seed, 0.0, 0.0, 0.0).shape
+        shape = PlacedObject(seed, 0.0, 0.0, 0.0).shape
         solid = np.asarray(signed_distance(shape, points)).reshape(1, 32, 32, 32) <= 0
         found[bool(shape.has_handle)].append(reach(solid)[0])
     assert len(found[True]) > 10 and min(found[True]) > REACH + 1.0
@@ -42,7 +42,7 @@ def test_the_prior_s_shapes_have_handles_as_often_as_the_family() -> None:
     """And seldom something between: the threshold decides next to nothing."""
     model = load_prior().model
     drawn = jax.random.normal(jax.random.key(1), (300, model.latent))
-    share = np.mean([bool(Placed(seed, 0.0, 0.0, 0.0).shape.has_handle) for seed in TRAIN_SEEDS[:300]])
+    share = np.mean([bool(PlacedObject(seed, 0.0, 0.0, 0.0).shape.has_handle) for seed in TRAIN_SEEDS[:300]])
     assert has_handle(model, drawn).mean() == pytest.approx(share, abs=0.08)
 
 
@@ -54,7 +54,7 @@ def test_what_is_said_is_scored() -> None:
 
 def test_answers_are_kept_and_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[str, int]] = []
-    seeds = [s for s in TEST_SEEDS[:200] if Placed(s, 0.0, 0.0, 0.0).shape.kind in (MUG, PITCHER)][:3]
+    seeds = [s for s in TEST_SEEDS[:200] if PlacedObject(s, 0.0, 0.0, 0.0).shape.kind in (MUG, PITCHER)][:3]
 
     def views(_: str, n: int, known: Any) -> Iterator[tuple[int, Any]]:
         for seed in seeds[:n]:
@@ -77,7 +77,7 @@ def test_answers_are_kept_and_compared(tmp_path: Path, monkeypatch: pytest.Monke
     rows = summary.rows
     assert asked == [(OWN, s) for s in seeds] + [(FROM_PRIOR.name, s) for s in seeds[:2]]
     value = {(r.method, r.metric): (r.value, r.n) for r in rows}
-    truth = np.mean([bool(Placed(s, 0.0, 0.0, 0.0).shape.has_handle) for s in seeds])
+    truth = np.mean([bool(PlacedObject(s, 0.0, 0.0, 0.0).shape.has_handle) for s in seeds])
     assert value[OWN, "p"] == (0.75, 3) and value[OWN, "share"] == (pytest.approx(truth), 3)
     assert value[FROM_PRIOR.name, "log_score_above_controller"] == (0.0, 2) and value[PRIOR, "p"][0] == 0.5
     assert value[OWN, "p where p is 0.6 to 1"] == (0.75, 3) and (OWN, "p where p is 0 to 0.05") not in value

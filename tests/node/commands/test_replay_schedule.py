@@ -20,7 +20,8 @@ from node.commands.config_file import load_config
 from node.commands.replay import ReplayConfig
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.hypotheses_file import load
-from perception.inference.controller import Estimate, View, estimate
+from perception.inference.controller import Estimate, estimate
+from perception.inference.publish import ConditionedView
 from perception.inference.schedule import config_hash, scheduled
 from perception.inference.settings import ControllerConfig
 from perception.observation.segmentation import Segment, segment
@@ -86,7 +87,7 @@ def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def pretending(monkeypatch: pytest.MonkeyPatch) -> None:
-    def pretend_view(view: View, prior: Prior, config: ControllerConfig, **asked: Any) -> Estimate:
+    def pretend_view(view: ConditionedView, prior: Prior, config: ControllerConfig, **asked: Any) -> Estimate:
         return pretend(view.frame, view.segment, prior, config, **asked)
 
     monkeypatch.setattr(perception.inference.tracker, "infer_view", pretend_view)

@@ -16,7 +16,8 @@ from node.commands.replay import ReplayConfig
 from perception.answers.hypotheses_file import load, save
 from perception.answers.query import query
 from perception.answers.regions import Box
-from perception.inference.controller import Estimate, View
+from perception.inference.controller import Estimate
+from perception.inference.publish import ConditionedView
 from perception.inference.schedule import config_hash, digest, scheduled
 from perception.inference.settings import ControllerConfig
 from perception.inference.tracker import Tracker
@@ -80,7 +81,7 @@ def test_a_schedule_repeats_the_object_that_it_names(
 ) -> None:
     """Nobody labels the objects. The second that came is the larger one, which segmentation puts first."""
 
-    def pretend_view(view: View, prior: Prior, config: ControllerConfig, **limits: Any) -> Estimate:
+    def pretend_view(view: ConditionedView, prior: Prior, config: ControllerConfig, **limits: Any) -> Estimate:
         return pretend(view.frame, view.segment, prior, config, **limits)
 
     monkeypatch.setattr(perception.inference.tracker, "infer_view", pretend_view)

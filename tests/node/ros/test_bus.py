@@ -15,7 +15,7 @@ import zenoh
 from node.commands.config_file import load_config
 from node.ros.bus import Bus
 from node.ros.messages import encode, make, register_service, type_hash
-from node.ros.rmw_zenoh import Node, attachment, gid, key, read_attachment
+from node.ros.rmw_zenoh import RosNode, attachment, gid, key, read_attachment
 from node.ros.settings import BusConfig
 from tests.node.peer import SET, SET_TEXT
 from tests.node.shapes import free_port
@@ -64,7 +64,7 @@ def test_a_gid_is_the_hash_of_the_token(token: str, expected: str) -> None:
 
 
 def test_names_are_those_of_ros() -> None:
-    node = Node(3, "a1b2", "/robot", "farside")
+    node = RosNode(3, "a1b2", "/robot", "farside")
     assert node.resolve("~/hypotheses") == "/robot/farside/hypotheses"
     assert (node.resolve("tf"), node.resolve("/tf")) == ("/robot/tf", "/tf")
     for name in ("", "a b", "~", "/a//b", "a/", "9a", "é"):
@@ -77,7 +77,7 @@ def test_names_are_those_of_ros() -> None:
         "@ros2_lv/3/a1b2/0/7/MP/%/%robot/farside/%robot%image/sensor_msgs::msg::dds_::Image_/RIHS01_00/::,10:,:,:,,"
     )
     assert token == expected
-    assert Node(0, "a1b2", "/", "n").token(0, "NN") == "@ros2_lv/0/a1b2/0/0/NN/%/%/n"
+    assert RosNode(0, "a1b2", "/", "n").token(0, "NN") == "@ros2_lv/0/a1b2/0/0/NN/%/%/n"
 
 
 def test_an_attachment_has_33_bytes_and_comes_back() -> None:

@@ -9,7 +9,7 @@ from calibration.camera import Camera
 from node.ros.bus import Bus
 from node.ros.messages import HYPOTHESES, hypotheses_from
 from node.ros.publishers import Announcer
-from node.ros.scene_messages import Status
+from node.ros.scene_messages import DiagnosticStatus
 from node.ros.settings import BusConfig, TopicConfig
 from node.ros.topic_source import TopicSource
 from perception.sources.frame import Frame
@@ -35,7 +35,7 @@ def test_every_topic_carries_the_scene() -> None:
         for name, kind in TOPICS.items():
             bus.subscribe(name, kind, came[name].append)
         announcer.scene(scene, CAMERA, "tempered_smc")
-        announcer.status(scene, [Status("farside: camera", "ok", "", {"rate (Hz)": 10.0})])
+        announcer.status(scene, [DiagnosticStatus("farside: camera", "ok", "", {"rate (Hz)": 10.0})])
         late: list[Any] = []
         bus.subscribe("~/hypotheses", HYPOTHESES, late.append, latched=True)
         deadline = time.monotonic() + 20.0

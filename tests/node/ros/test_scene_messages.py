@@ -11,7 +11,7 @@ from node.ros.messages import decode, encode, matrix
 from node.ros.scene_messages import (
     CLOUD_FIELDS,
     MAX_TRIANGLES,
-    Status,
+    DiagnosticStatus,
     counts_status,
     diagnostics_message,
     markers_message,
@@ -129,7 +129,7 @@ def test_diagnostics_say_what_is_wrong() -> None:
     statuses = [
         sampler_status(h, STAMP_NS + 2 * 10**9),
         counts_status(counts),
-        Status("farside: camera", "stale", "gone", {}),
+        DiagnosticStatus("farside: camera", "stale", "gone", {}),
     ]
     sampler, bus, camera = there_and_back(diagnostics_message(STAMP_NS, statuses)).status
     assert (sampler.level, bus.level, camera.level) == (1, 1, 3)

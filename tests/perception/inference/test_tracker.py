@@ -12,7 +12,7 @@ from perception.inference.tracker import Tracker, _Kept, _same_plane, _with_view
 from perception.observation.rays import observe
 from perception.observation.segmentation import segment
 from perception.simulation.sensor_faults import simulate
-from perception.simulation.simulated_camera import Placed, Scene, place_camera
+from perception.simulation.simulated_camera import PlacedObject, TableScene, place_camera
 from perception.sources.frame import Frame
 from probnerf.objects.tabletop import part_distances
 from probnerf.prior.checkpoint import load_prior
@@ -21,12 +21,12 @@ from tests.node.mugs import CAMERA, MUG
 QUICK = ControllerConfig(hypotheses=32, runs=1)
 
 
-def frame_from(azimuth: float, mug: Placed = MUG, stamp_ns: int = 0, seed: int = 0) -> Frame:
+def frame_from(azimuth: float, mug: PlacedObject = MUG, stamp_ns: int = 0, seed: int = 0) -> Frame:
     """The mug seen from an azimuth about its own place (0: the side that hides its handle)."""
     a = np.radians(azimuth)
     position = (mug.x + 0.42 * float(np.cos(a)), mug.y + 0.42 * float(np.sin(a)), 0.3)
     T = place_camera(position, (mug.x, mug.y, 0.03))
-    frame = simulate(Scene((mug,)), CAMERA, T, seed=seed)
+    frame = simulate(TableScene((mug,)), CAMERA, T, seed=seed)
     return replace(frame, stamp_ns=stamp_ns, T_world_camera=T)
 
 

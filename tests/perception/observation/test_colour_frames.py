@@ -16,7 +16,7 @@ from perception.observation.segmentation import segment
 from perception.observation.settings import ObserveConfig
 from perception.observation.visibility import seen_voxels
 from perception.simulation.sensor_faults import simulate
-from perception.simulation.simulated_camera import Placed, Scene, place_camera
+from perception.simulation.simulated_camera import PlacedObject, TableScene, place_camera
 from perception.sources.frame import Frame
 from probnerf.fields.cylinder import CylinderModel
 from probnerf.likelihood.position import pose_of
@@ -112,17 +112,17 @@ FEW = ControllerConfig(
 )
 
 
-def on_a_table(seed: int) -> tuple[Placed, Frame]:
+def on_a_table(seed: int) -> tuple[PlacedObject, Frame]:
     """A validation object, handle or front anywhere, seen from 35 degrees above."""
     rng = np.random.default_rng(seed)
-    placed = Placed(seed, 0.0, 0.0, rng.uniform(-np.pi, np.pi))
+    placed = PlacedObject(seed, 0.0, 0.0, rng.uniform(-np.pi, np.pi))
     distance = 4.5 * placed.half_extent
     target = placed.T_world_object[:3, 3]
     camera = place_camera((0.82 * distance, 0.0, float(target[2]) + 0.57 * distance), tuple(target))
-    return placed, simulate(Scene((placed,)), CAMERA, camera, seed)
+    return placed, simulate(TableScene((placed,)), CAMERA, camera, seed)
 
 
-def occupied(placed: Placed, frame: Frame, h: Hypotheses) -> np.ndarray:
+def occupied(placed: PlacedObject, frame: Frame, h: Hypotheses) -> np.ndarray:
     """Which voxels of the hypotheses' grid have their centre in the true body."""
     assert frame.T_world_camera is not None
     T_object_cube = np.linalg.inv(placed.T_world_object) @ frame.T_world_camera

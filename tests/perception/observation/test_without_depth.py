@@ -11,7 +11,7 @@ from perception.observation.object_frame import object_frame
 from perception.observation.segmentation import segment
 from perception.observation.settings import ObserveConfig, PlaneGuess, SegmentConfig
 from perception.observation.without_depth import StandingBody, plane_depth, standing_body, supposed_plane
-from perception.simulation.simulated_camera import Placed, Scene, place_camera, render
+from perception.simulation.simulated_camera import PlacedObject, TableScene, place_camera, render
 from perception.sources.frame import Frame
 from probnerf.objects.tabletop import VALIDATION_SEEDS
 from probnerf.types import FREE, OBJECT
@@ -116,13 +116,13 @@ def standardised(seed: int, height_sigma: float, tilt_sigma: float) -> np.ndarra
     The supposed plane errs by a draw from the stated distribution.
     """
     rng = np.random.default_rng([seed, 37])
-    placed = Placed(seed, rng.uniform(-0.05, 0.05), rng.uniform(-0.05, 0.05), rng.uniform(-np.pi, np.pi))
+    placed = PlacedObject(seed, rng.uniform(-0.05, 0.05), rng.uniform(-0.05, 0.05), rng.uniform(-np.pi, np.pi))
     middle, elevation = placed.T_world_object[:3, 3], np.radians(rng.uniform(15, 60))
     azimuth, distance = rng.uniform(-0.3, 0.3), max(rng.uniform(0.4, 0.7), 3.5 * placed.half_extent)
     towards = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
     T = place_camera(tuple(middle + distance * towards), tuple(middle + rng.normal(0.0, 0.02, 3)))
     camera = Camera(240, 180, np.array([[225.0, 0, 119.5], [0, 225.0, 89.5], [0, 0, 1]]), np.zeros(5))
-    seen = render(Scene((placed,)), camera, T)
+    seen = render(TableScene((placed,)), camera, T)
     supposed = T.copy()
     supposed[:3, :3] = T[:3, :3] @ cv2.Rodrigues(np.array([np.radians(tilt_sigma) * rng.normal(), 0, 0]))[0]
     supposed[2, 3] += height_sigma * rng.normal()

@@ -7,7 +7,7 @@ from calibration.camera import Camera
 from perception.observation.segmentation import backproject, segment
 from perception.simulation import sample_recording
 from perception.simulation.sensor_faults import SensorConfig, sense, simulate
-from perception.simulation.simulated_camera import Picture, Placed, Scene, place_camera, render, truth
+from perception.simulation.simulated_camera import FaultlessImage, PlacedObject, TableScene, place_camera, render, truth
 from perception.sources.frame import Frame
 from perception.sources.open_source import open_source
 from perception.sources.settings import SHIPPED_LOG
@@ -15,11 +15,11 @@ from probnerf.objects.tabletop import part_distances, signed_distance
 
 CAMERA = Camera(160, 120, np.array([[150.0, 0, 80.3], [0, 151.0, 59.1], [0, 0, 1]]), np.array([0.05, -0.1, 0, 0, 0.0]))
 T_WORLD_CAMERA = place_camera((0.4, 0.1, 0.3), (0.0, 0.0, 0.03))
-SCENE = Scene((Placed(2_900_727, -0.03, -0.05, 2.0), Placed(2_900_483, 0.0, 0.08, 0.3)))
+SCENE = TableScene((PlacedObject(2_900_727, -0.03, -0.05, 2.0), PlacedObject(2_900_483, 0.0, 0.08, 0.3)))
 
 
 @pytest.fixture(scope="module")
-def picture() -> Picture:
+def picture() -> FaultlessImage:
     return render(SCENE, CAMERA, T_WORLD_CAMERA)
 
 
@@ -29,17 +29,17 @@ def shipped_frames() -> list[Frame]:
 
 
 @pytest.fixture(scope="module")
-def shipped_picture() -> Picture:
+def shipped_picture() -> FaultlessImage:
     return render(sample_recording.SCENE, sample_recording.CAMERA, sample_recording.T_WORLD_CAMERA)
 
 
-def in_cube(frame: Frame, pixels: np.ndarray, placed: Placed, T_camera_object: np.ndarray) -> np.ndarray:
+def in_cube(frame: Frame, pixels: np.ndarray, placed: PlacedObject, T_camera_object: np.ndarray) -> np.ndarray:
     """The points that pixels see, in an object's canonical cube."""
     points = backproject(frame)[pixels]
     return (points - T_camera_object[:3, 3]) @ T_camera_object[:3, :3] / placed.half_extent
 
 
-def test_depth_lies_on_the_true_surfaces(picture: Picture) -> None:
+def test_depth_lies_on_the_true_surfaces(picture: FaultlessImage) -> None:
     """Through a lens with distortion, and through `truth`."""
     assert set(np.unique(picture.label)) == {0, 1, 2}
     frame = Frame(np.zeros((120, 160, 3), np.uint8), picture.depth.astype(np.float32), CAMERA, frame_id="")
@@ -57,7 +57,7 @@ def test_noise_has_the_stated_size() -> None:
     camera = Camera(200, 200, np.array([[200.0, 0, 100], [0, 200.0, 100], [0, 0, 1]]), np.zeros(5))
     for z in (0.4, 1.2):
         flat = np.full((200, 200), z + 0.0003)
-        plane = Picture(np.zeros((200, 200, 3)), flat, flat, flat, np.zeros((200, 200), np.int32))
+        plane = FaultlessImage(np.zeros((200, 200, 3)), flat, flat, flat, np.zeros((200, 200), np.int32))
         depth = sense(plane, camera, None, seed=3).depth
         sigma = np.hypot(0.001 + 0.002 * z**2, 0.001 / np.sqrt(12))
         error = (depth - flat)[np.isfinite(depth)]
@@ -70,13 +70,13 @@ def test_blobs_may_reach_over_every_border() -> None:
     """A blob may be wider than the picture, and may have its middle at any edge."""
     camera = Camera(24, 12, np.array([[20.0, 0, 12], [0, 20.0, 6], [0, 0, 1]]), np.zeros(5))
     flat = np.full((12, 24), 0.5)
-    plane = Picture(np.zeros((12, 24, 3)), flat, flat, flat, np.zeros((12, 24), np.int32))
+    plane = FaultlessImage(np.zeros((12, 24, 3)), flat, flat, flat, np.zeros((12, 24), np.int32))
     many = SensorConfig(blobs=0.1, blob_radius=8.0)
     lost = [np.isnan(sense(plane, camera, None, seed=s, config=many).depth).mean() for s in range(20)]
     assert min(lost) > 0.5
 
 
-def test_depth_fails_at_edges_and_in_the_stereo_shadow(picture: Picture) -> None:
+def test_depth_fails_at_edges_and_in_the_stereo_shadow(picture: FaultlessImage) -> None:
     frame = sense(picture, CAMERA, T_WORLD_CAMERA, seed=1)
     lost = np.isnan(frame.depth)
     mixed = picture.farthest - picture.nearest > 0.05
@@ -95,7 +95,7 @@ def test_depth_fails_at_edges_and_in_the_stereo_shadow(picture: Picture) -> None
 
 
 def test_grazing_surfaces_have_no_depth() -> None:
-    table = Scene(())
+    table = TableScene(())
     T = place_camera((0.4, 0.0, 0.04), (-0.4, 0.0, 0.0))
     lost = np.isnan(simulate(table, CAMERA, T, 0, SensorConfig(blobs=0.0, flying=0.0)).depth)
     below = np.degrees(np.arctan((np.arange(120) - CAMERA.K[1, 2]) / CAMERA.K[1, 1]) + np.arctan(0.04 / 0.8))
@@ -109,7 +109,9 @@ def test_frames_are_functions_of_the_seed() -> None:
     assert np.array_equal(first.label, other.label)
 
 
-def test_shipped_recording_is_what_its_script_makes(shipped_frames: list[Frame], shipped_picture: Picture) -> None:
+def test_shipped_recording_is_what_its_script_makes(
+    shipped_frames: list[Frame], shipped_picture: FaultlessImage
+) -> None:
     assert SHIPPED_LOG.stat().st_size < 2_000_000
     assert [f.stamp_ns for f in shipped_frames] == [
         sample_recording.START_NS + i * sample_recording.STEP_NS for i in range(5)
@@ -123,7 +125,9 @@ def test_shipped_recording_is_what_its_script_makes(shipped_frames: list[Frame],
     assert np.median(np.abs(first.rgb.astype(int) - made.rgb)) <= 1
 
 
-def test_shipped_mug_is_found_and_its_handle_is_hidden(shipped_frames: list[Frame], shipped_picture: Picture) -> None:
+def test_shipped_mug_is_found_and_its_handle_is_hidden(
+    shipped_frames: list[Frame], shipped_picture: FaultlessImage
+) -> None:
     mug, carton = segment(shipped_frames[0])
     for found, i in ((mug, 1), (carton, 2)):
         true = shipped_picture.label == i

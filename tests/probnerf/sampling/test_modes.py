@@ -14,7 +14,7 @@ from probnerf.likelihood.dispatch import log_likelihood
 from probnerf.likelihood.pixel_terms import log_likelihood_one
 from probnerf.objects.cylinder_scenes import integrate, scene, total_variation, yaw_histogram
 from probnerf.prior.networks import PRESETS, ProbNeRF
-from probnerf.prior.posterior_network import Picture, guesses, potential_at
+from probnerf.prior.posterior_network import EncoderPicture, guesses, potential_at
 from probnerf.sampling import modes
 from probnerf.sampling.gaussian_mixture import GaussianMixture
 from probnerf.sampling.modes import log_posterior, mixture_of_modes
@@ -151,7 +151,7 @@ def _tiny():
     model = ProbNeRF(PRESETS["tiny"], jax.random.key(0))
     size = model.preset.image_size
     T = jnp.asarray(look_at(np.array([4.0, 0.0, 1.5]), np.zeros(3)), jnp.float32)
-    picture = Picture(
+    picture = EncoderPicture(
         jnp.full((size, size, 3), 0.5), jnp.full((size, size), 4.0), jnp.zeros((size, size)), T, jnp.asarray(0.35)
     )
     return model, picture, scene("hidden", True)[2]
