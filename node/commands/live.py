@@ -172,7 +172,7 @@ class LiveNode:
         self.frames = self.inferences = self.answered = 0
         self._scene: dict[int, Hypotheses] = {}
         self._said: dict[str, int] = {}  # what went wrong, and how often
-        self._hash = config_hash(config.controller, config.segment)
+        self._hash = config_hash(config.controller, config.segment, config.track)
         self._told = 0.0
         self._recording_told = False
         self._until = math.inf  # on time.monotonic()'s clock

@@ -103,12 +103,18 @@ def _looks(
 
 def _check(path: Path, entries: Sequence[Scheduled], prior: Prior, config: ReplayConfig) -> None:
     """Raises ValueError where another prior or configuration was recorded."""
-    asked = config_hash(config.inference, config.segment)
+    asked = config_hash(config.inference, config.segment, config.track)
+    without_track = config_hash(config.inference, config.segment)  # what Farside before 0.2.0 recorded
     for entry in entries:
         if entry.prior_hash != prior.hash:
             raise ValueError(
                 f"{path} was recorded with prior {entry.prior_hash}, and this one is {prior.hash}; give that one's file"
                 " with --prior"
+            )
+        if entry.config_hash == without_track:
+            raise ValueError(
+                f"{path} was recorded by Farside before 0.2.0, whose schedules do not tell of the tracker's settings;"
+                " record it again, or replay it with the version that recorded it"
             )
         if entry.config_hash != asked:
             raise ValueError(

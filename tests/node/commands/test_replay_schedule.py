@@ -70,7 +70,7 @@ def record_session(folder: Path, first: Frame, infer: Callable[..., Estimate]) -
                 continue  # the sampler was still busy
             found = segment(frame, 1, config.segment)[0]
             h = infer(frame, found, prior, config.inference, seed=3 + i, stages=2).hypotheses
-            recorder.write_schedule(scheduled(h, config_hash(config.inference, config.segment)))
+            recorder.write_schedule(scheduled(h, config_hash(config.inference, config.segment, config.track)))
             live.append(h)
     return folder, live
 
@@ -150,6 +150,8 @@ def test_what_comes_out_otherwise_is_said(
     [
         ({"prior_hash": "0" * 16}, [], "was recorded with prior 0000000000000000, and this one is"),
         ({}, ["--method", "annealed_hmc"], r"was recorded with configuration .* --config and --method"),
+        ({}, ["--config", "{folder}/tracked.yaml"], r"was recorded with configuration .* --config and --method"),
+        ({"config_hash": "{before}"}, [], r"was recorded by Farside before 0\.2\.0, .* record it again"),
         ({"object_id": 9}, [], "has nothing in this range whose inference can be repeated"),
         ({}, ["--object", "2"], "has no schedule for object 2; leave --schedule away"),
         ({}, ["--from", "5"], "has no frame from 5 s on; it runs from 0 to 0.000 s"),
@@ -163,8 +165,13 @@ def test_what_cannot_be_repeated_is_named(
     more: list[str],
     says: str,
 ) -> None:
+    folder, _ = session
+    config = load_config(folder / "few.yaml", ReplayConfig)
+    before = config_hash(config.inference, config.segment)  # without the tracker's settings
+    changes = {name: before if value == "{before}" else value for name, value in changes.items()}
     path = other(session, tmp_path, **changes)
-    given = run(session[0], tmp_path / "out", *more)
+    (tmp_path / "tracked.yaml").write_text(FEW + "track: {adds: 0.2}\n")
+    given = run(folder, tmp_path / "out", *(argument.format(folder=tmp_path) for argument in more))
     assert main([given[0], str(path), *given[2:]]) == 1
     lines = capsys.readouterr().err.splitlines()
     assert re.search(says, lines[-1]) and lines[-1].startswith("farside: error: ") and not (tmp_path / "out").exists()

@@ -96,7 +96,9 @@ def test_a_schedule_repeats_the_object_that_it_names(
             recorder.write_frame(frame)
             for look in [tracker.look(frame, s, lambda _: (7, True)) for s in segment(frame, None, config.segment)]:
                 live.append(tracker.infer(look, stages=2).hypotheses)
-                recorder.write_schedule(scheduled(live[-1], config_hash(config.inference, config.segment)))
+                recorder.write_schedule(
+                    scheduled(live[-1], config_hash(config.inference, config.segment, config.track))
+                )
     assert [h.object_id for h in live] == [1, 2, 1]
     options = ["--prior", str(tmp_path / "tiny.safetensors"), "--config", str(tmp_path / "few.yaml"), "--schedule"]
     options += ["--out", str(tmp_path / "out"), *([] if wanted is None else ["--object", str(wanted)])]
