@@ -199,6 +199,17 @@ def has_global_state(path: PurePosixPath, tree: ast.Module) -> Iterator[str]:
             yield f"{path}:{node.lineno} rebinds the module's {', '.join(node.names)}: pass it as an argument"
 
 
+def hides_a_broken_install(path: PurePosixPath, tree: ast.Module) -> Iterator[str]:
+    """Whatever else is installed, our own modules are there."""
+    missing = {"ImportError", "ModuleNotFoundError"}
+    for node in (node for node in ast.walk(tree) if isinstance(node, ast.Try)):
+        ours = imports(path, ast.Module(node.body, [])) & {*MAY_IMPORT}
+        kinds = [handler.type for handler in node.handlers]
+        caught = {name.id for kind in kinds if kind for name in ast.walk(kind) if isinstance(name, ast.Name)}
+        if ours and caught & missing:
+            yield f"{path}:{node.lineno} goes on without {', '.join(sorted(ours))}, which is installed or broken"
+
+
 def has_vague_name(path: PurePosixPath, tree: ast.Module) -> Iterator[str]:
     for part in {path.stem, *path.parts[:-1]} & {"util", "utils", "helper", "helpers", "misc", "common"}:
         yield f"{path}: `{part}` says nothing; name the concept"
@@ -225,6 +236,7 @@ RULES = (
     breaks_importer_rule,
     can_execute_code,
     has_global_state,
+    hides_a_broken_install,
     has_vague_name,
     has_untyped_signature,
 )
@@ -300,6 +312,12 @@ def test_launch_holds_no_python_package() -> None:
         (can_execute_code, "probnerf/a.py", "np.load(f, allow_pickle=True)", "a.py:1 passes allow_pickle"),
         (can_execute_code, "probnerf/a.py", "import pickle", "imports pickle"),
         (has_global_state, "probnerf/a.py", "def f():\n    global x", "a.py:2 rebinds the module's x"),
+        (
+            hides_a_broken_install,
+            "node/a.py",
+            "try:\n    from perception.answers.query import query\nexcept (OSError, ImportError):\n    pass",
+            "a.py:1 goes on without perception",
+        ),
         (has_vague_name, "node/utils.py", "", "`utils` says nothing"),
         (has_untyped_signature, "node/a.py", "class A:\n    def f(self, x) -> int: ...", "a.py:2 f: no type for x"),
     ],
