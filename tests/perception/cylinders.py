@@ -32,15 +32,22 @@ def looking_down(degrees: float = 35.0, distance: float = 0.7, at: tuple[float, 
     return T
 
 
-def picture(*things: Cylinder, T: np.ndarray | None = None, noise: float = 1.0, label: bool = True) -> Frame:
+def picture(
+    *things: Cylinder,
+    T: np.ndarray | None = None,
+    noise: float = 1.0,
+    label: bool = True,
+    camera: Camera = CAMERA,
+    table_radius: float = TABLE_RADIUS,
+) -> Frame:
     """A frame whose label map numbers the cylinders from 1; `noise` times (1 mm + 2 mm z^2), and 1% without depth."""
     T = looking_down() if T is None else T
-    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
-    rays = CAMERA.rays(np.column_stack([u.ravel(), v.ravel()]))
+    v, u = np.mgrid[: camera.height, : camera.width]
+    rays = camera.rays(np.column_stack([u.ravel(), v.ravel()]))
     o, d = T[:3, 3], rays @ T[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
         table = -o[2] / d[:, 2]
-        off = np.linalg.norm((o + table[:, None] * d)[:, :2], axis=1) > TABLE_RADIUS
+        off = np.linalg.norm((o + table[:, None] * d)[:, :2], axis=1) > table_radius
         table[(table < 0) | off] = np.inf
         floor = (FLOOR - o[2]) / d[:, 2]
         wall = (WALL - o[1]) / d[:, 1]
@@ -62,11 +69,11 @@ def picture(*things: Cylinder, T: np.ndarray | None = None, noise: float = 1.0, 
     depth = depth + noise * (1e-3 + 2e-3 * depth**2) * rng.normal(size=depth.shape)
     depth[rng.random(depth.shape) < 0.01 * (noise > 0)] = np.nan
     colours = np.array([[200, 190, 170], [220, 40, 30], [30, 60, 220], [40, 180, 60]], np.uint8)
-    shape = (CAMERA.height, CAMERA.width)
+    shape = (camera.height, camera.width)
     return Frame(
         colours[ids].reshape(*shape, 3),
         depth.reshape(shape).astype(np.float32),
-        CAMERA,
+        camera,
         label=ids.reshape(shape) if label else None,
     )
 

@@ -184,6 +184,18 @@ def test_a_scene_is_joint_over_its_objects(mug):
     assert cover.unseen_fraction == pytest.approx(0.5 * (1 - cover.outside_fraction), abs=0.02)
 
 
+def test_an_error_is_scaled_as_the_answer_that_it_is_the_error_of(mug):
+    """What caution adds is no sampler's: p_free and its error shrink alike."""
+    few = replace(mug, weights=np.array([0.3, 0.7]), seen=np.ones((GRID,) * 3, bool))
+    boxes = [Box(*LEFT), Box((-0.1, -0.1, 0.09), (0.1, 0.1, 0.15))]  # taken by the one population, and free to both
+    (taken, free), (doubted, as_free) = (
+        [query([h], box, "object") for box in boxes] for h in (few, replace(few, out_of_model=True))
+    )
+    slope = (as_free.p_free - doubted.p_free) / (free.p_free - taken.p_free)
+    assert 0.0 < slope < 1.0 and taken.p_free_se > 0.0
+    assert doubted.p_free_se == pytest.approx(slope * taken.p_free_se)
+
+
 def test_seen_by_one_object_is_seen(mug):
     twin = replace(mug, object_id=2, seen=np.ones((GRID,) * 3, bool))
     box = Box((-0.1, -0.1, 0.4), (0.1, 0.1, 0.6))

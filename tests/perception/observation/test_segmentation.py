@@ -13,7 +13,7 @@ from perception.observation.support_plane import heights
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import read_frame_folder
 from probnerf.types import FREE, OBJECT, UNKNOWN
-from tests.perception.cylinders import CAN, TABLE_RADIUS, Cylinder, looking_down, picture
+from tests.perception.cylinders import CAMERA, CAN, TABLE_RADIUS, Cylinder, looking_down, picture
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:
@@ -77,6 +77,21 @@ def test_a_low_thing_before_a_tall_one_does_not_cut_it() -> None:
     frame = picture(Cylinder(-0.053, 0.0, 0.045, 0.12), Cylinder(0.0, -0.075, 0.04, 0.06))
     best = max(segment(replace(frame, label=None)), key=lambda s: (s.mask & (frame.label == 1)).sum())
     assert (best.mask & (frame.label == 1)).sum() > 0.9 * (frame.label == 1).sum()
+
+
+@pytest.mark.parametrize("distance", [0.8, 1.5])
+def test_what_belongs_to_a_foot_is_judged_by_the_noise_at_its_distance(distance: float) -> None:
+    """A thin plate about a can is its foot where it is higher than the sensor can err there, and table where not."""
+    focal = 450.0 * distance  # the picture is the same from everywhere
+    camera = replace(CAMERA, K=np.array([[focal, 0.0, 159.5], [0.0, focal, 119.5], [0.0, 0.0, 1.0]]))
+    config = SegmentConfig(voxel=0.02)
+    least = config.base * max(1.0, distance**2)
+    for height, belongs in ((0.7 * least, False), (1.3 * least, True)):
+        can, plate = Cylinder(0.0, 0.0, 0.1, 0.2), Cylinder(0.0, 0.0, 0.13, height)
+        frame = picture(can, plate, T=looking_down(50.0, distance), noise=0.0, camera=camera, table_radius=1.5)
+        (found,) = segment(replace(frame, label=None), config=config)
+        assert iou(found.mask, frame.label > 0 if belongs else frame.label == 1) > 0.8
+        assert (found.mask & (frame.label == 2)).any() == belongs
 
 
 def partition(s: Segment) -> None:
