@@ -4,6 +4,7 @@ Each raises AssertionError where its law is broken. Bounds are multiples of the 
 """
 
 import importlib
+import math
 import sys
 import types
 from pathlib import Path
@@ -206,6 +207,31 @@ def a_mixture_has_the_density_that_it_draws_from(mixture: ModuleType) -> None:
     assert_zero(ratio - 1.0)
     assert_zero(ratio[:, None] * np.asarray(q, np.float64))
     assert_zero(ratio[:, None] * (np.asarray(q, np.float64) ** 2 - 1.0))
+
+
+def smc_moves_each_half_by_what_the_other_says(smc: ModuleType) -> None:
+    """After two moves, the second by a tuned step size, exact draws of the posterior are still its draws.
+
+    It has a narrow part and a wide one, where very different steps are accepted: by step sizes that followed their own
+    particles the narrow part would gain. (Two moves: at the third a step size knows of its own half again, through what
+    the other half's owed to it.)
+    """
+    root = jnp.array([5.0, 1.0])
+    reference = GaussianMixture(jnp.log(jnp.full(2, 0.5)), jnp.zeros((2, 1)), root[:, None, None])
+    config = smc.TemperedSMCConfig(
+        populations=32768, particles=2, start_particles=2, moves=2, leapfrog_steps=1, final_stages=1, keep=1,
+        evidence_power=0.0, metric=False,
+    )  # fmt: skip
+    posterior = smc.tempered_smc(jax.random.key(0), _as_the_mixture, reference, 1, config, reference=reference)
+    q = np.asarray(posterior.positions, np.float64).reshape(config.populations, config.moves, config.particles)[:, -1]
+    for width in (0.1, 0.3, 1.0):
+        inside = 0.5 * math.erf(5.0 * width / math.sqrt(2.0)) + 0.5 * math.erf(width / math.sqrt(2.0))
+        assert_zero((np.abs(q) < width).mean(axis=1) - inside)
+
+
+def _as_the_mixture(mixture, q):
+    """The likelihood that makes `mixture` the posterior."""
+    return mixture.over_prior(q)
 
 
 def resampling_gives_each_its_due(resampling: ModuleType) -> None:

@@ -14,6 +14,7 @@ LAWS = [
     (laws.resampling_gives_each_its_due, resampling),
     (laws.smc_takes_proposals_for_what_they_are, tempered_smc),
     (laws.smc_finds_the_same_from_any_reference, tempered_smc),
+    (laws.smc_moves_each_half_by_what_the_other_says, tempered_smc),
     (laws.hmc_leaves_a_target_between_reference_and_posterior_alone, hmc),
     (laws.a_cut_run_goes_on_from_the_density_that_it_reached, populations),
     (laws.a_mixture_has_the_density_that_it_draws_from, gaussian_mixture),
@@ -103,6 +104,10 @@ MUTATIONS = {
                 "args, jnp.ones_like(state.beta)[:, None], state.metric, reference)",
             )
         ),
+    ),
+    "step sizes that follow the particles they move": (
+        laws.smc_moves_each_half_by_what_the_other_says,
+        smc_edited(("(chain, tuned[:, ::-1])", "(chain, tuned)")),
     ),
     "starts weighed as if the prior had drawn them": (
         laws.smc_takes_proposals_for_what_they_are,

@@ -1,5 +1,6 @@
 """A further view, and a run that goes on: the posterior of all views, by brute force."""
 
+from dataclasses import replace
 from functools import cache
 
 import jax
@@ -50,6 +51,19 @@ def _both(first: Args, second: Args) -> Args:
 def _first() -> tuple[Args, Posterior]:
     args = scene("hidden", True)
     return args, tempered_smc(jax.random.key(0), log_likelihood, args, 9, CONFIG)
+
+
+def test_joined_views_are_of_one_object_whose_place_is_as_uncertain_as_the_first_view_says() -> None:
+    """Its pose's latents are scaled by the first's widths, whatever the widths a later view was given."""
+    sizes = {"columns": 6, "rows": 4, "cubes": 8}
+    first, second = scene("hidden", True, **sizes), scene("hidden", True, azimuth=110.0, seed=1, **sizes)
+    first = (*first[:2], replace(first[2], pose_sigma=jnp.array([0.1, 0.05, 0.2, 0.03, 0.02])), first[3])
+    wider = replace(second[2], pose_sigma=10.0 * first[2].pose_sigma)
+    q = jax.random.normal(jax.random.key(1), (3, 9))
+    as_first = (*second[:2], replace(second[2], pose_sigma=first[2].pose_sigma), second[3])
+    together = _each(_both(first, (*second[:2], wider, second[3])), q)
+    np.testing.assert_allclose(together, _each(first, q) + _each(as_first, q), rtol=1e-5)
+    assert not np.allclose(_each((*second[:2], wider, second[3]), q), _each(as_first, q), rtol=0.01)  # so they tell
 
 
 @pytest.mark.slow
