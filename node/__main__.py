@@ -96,8 +96,7 @@ def _query(args: Sequence[str]) -> int:
         raise ValueError("a query needs one of --box X0 Y0 Z0 X1 Y1 Z1, --points FILE.xyz and --mesh FILE.obj")
     from node.figures.query_answer import answer
     from perception.answers.hypotheses_file import load_scene
-    from perception.answers.regions import Box, Region, read_mesh
-    from perception.answers.xyz import read_points
+    from perception.answers.regions import Box, Region, read_mesh, read_points
 
     scene = load_scene(options.file)
     region: Region

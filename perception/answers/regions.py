@@ -89,6 +89,33 @@ class Cells:
 Region = Box | Points | Swept | Cells
 
 
+def read_points(path: str | Path) -> Points:
+    """Read an .xyz file: one point a line, x y z in metres; further columns and # comments are left out.
+
+    Raises FileNotFoundError, or ValueError naming the line.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; give a text file with x y z (metres) on each line")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise ValueError(f"{path} is not a text file; write x y z (metres) on each line") from None
+    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.partition("#")[0].strip()]
+    if not lines:
+        raise ValueError(f"{path} holds no points; write x y z (metres) on each line")
+    unread = iter(lines)
+    try:
+        points = np.loadtxt((line for _, line in unread), usecols=(0, 1, 2), ndmin=2)
+    except ValueError:
+        number, line = lines[-1 - len(list(unread))]
+        raise ValueError(f"{path}, line {number}: '{line[:60]}' is not a point; write x y z (metres)") from None
+    if not (finite := np.isfinite(points).all(axis=1)).all():
+        number, line = lines[int(finite.argmin())]
+        raise ValueError(f"{path}, line {number}: '{line[:60]}' is not finite; leave the line out")
+    return Points(points)
+
+
 def read_mesh(path: Path, width: float) -> Cells:
     """What a mesh file (.obj, .stl, .ply, .off, .glb; metres) fills, in its own frame: cells that its surface meets or
     encloses. A surface with an opening wider than a cell encloses nothing there.

@@ -8,7 +8,6 @@ import pytest
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.query import CAUTION, query
 from perception.answers.regions import Box, Points, Swept
-from perception.answers.xyz import read_points
 from perception.observation.object_frame import ObjectFrame
 from probnerf.rendering.occupancy import voxel_centres
 
@@ -261,28 +260,6 @@ def test_questions_that_mean_nothing_are_refused(mug):
         query([mug, replace(mug, object_id=2, stamp_ns=5)], box, "camera")
     with pytest.raises(ValueError, match="no objects"):
         query([], box, "camera")
-
-
-def test_points_are_read_and_bad_lines_named(tmp_path):
-    path = tmp_path / "grasp.xyz"
-    path.write_text("# x y z\n0.1 -2 3e-1\n\n1 2 3 255 0 0  # with colour\n")
-    np.testing.assert_allclose(read_points(path).points, [[0.1, -2, 0.3], [1, 2, 3]])
-    cases = {
-        "1 2\n": "line 1: '1 2' is not a point",
-        "1 2 3\nx y z\n": "line 2: 'x y z' is not a point",
-        "1 2 nan\n": "line 1: '1 2 nan' is not finite",
-        "# nothing\n": "holds no points",
-        "": "holds no points",
-    }
-    for text, message in cases.items():
-        path.write_text(text)
-        with pytest.raises(ValueError, match=message):
-            read_points(path)
-    path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ValueError, match="not a text file"):
-        read_points(path)
-    with pytest.raises(FileNotFoundError, match=r"absent\.xyz: no such file"):
-        read_points(tmp_path / "absent.xyz")
 
 
 def _swept(*boxes: tuple[tuple[float, ...], tuple[float, ...]]) -> Swept:

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from perception.answers.query import query
-from perception.answers.regions import Cells, Swept, read_mesh
+from perception.answers.regions import Cells, Swept, read_mesh, read_points
 from tests.perception.answers.test_query import LEFT, RIGHT, VOXEL, _swept, mug
 
 __all__ = ["mug"]  # the fixture
@@ -81,3 +81,27 @@ def test_what_is_no_mesh_is_named(tmp_path: Path) -> None:
         read_mesh(_saved(tmp_path / "mm.stl", trimesh.creation.box((300.0, 300.0, 300.0))), 0.0025)
     with pytest.raises(ValueError, match="more than 0"):
         Cells(np.zeros((1, 3)), 0.0)
+
+
+def test_points_are_read_and_bad_lines_named(tmp_path):
+    path = tmp_path / "grasp.xyz"
+    path.write_text("# x y z\n0.1 -2 3e-1\n\n1 2 3 255 0 0  # with colour\n")
+    np.testing.assert_allclose(read_points(path).points, [[0.1, -2, 0.3], [1, 2, 3]])
+    cases = {
+        "1 2\n": "line 1: '1 2' is not a point",
+        "1 2 3\nx y z\n": "line 2: 'x y z' is not a point",
+        "# a\n\n1 2 3\n# b\n4 5\n6 7 8\n": "line 5: '4 5' is not a point",
+        "# a\n1 2 3\n1 -inf 2\n": "line 3: '1 -inf 2' is not finite",
+        "1 2 nan\n": "line 1: '1 2 nan' is not finite",
+        "# nothing\n": "holds no points",
+        "": "holds no points",
+    }
+    for text, message in cases.items():
+        path.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            read_points(path)
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match="not a text file"):
+        read_points(path)
+    with pytest.raises(FileNotFoundError, match=r"absent\.xyz: no such file"):
+        read_points(tmp_path / "absent.xyz")
