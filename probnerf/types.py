@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 # Height of the support plane in the cube, in the view frame and in the canonical object frame alike.
 BASE_Z = -0.75
+BODY_EXTENT = 1.4  # the larger of an object's longest horizontal side and its height, without handle and spout
 
 # Pixel statuses of an Observation (object / free / unknown).
 UNKNOWN, OBJECT, FREE = 0, 1, 2

@@ -13,10 +13,9 @@ from perception.observation.support_plane import heights
 from perception.observation.visible_extent import visible_body
 from perception.observation.without_depth import standing_body
 from perception.sources.frame import Frame
-from probnerf.types import BASE_Z, OBJECT
+from probnerf.types import BASE_Z, BODY_EXTENT, OBJECT
 
 # The larger of a body's width and height is this many cube units: the scale convention of the prior.
-BODY_EXTENT = 1.4
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,7 @@ from scipy import ndimage
 
 from calibration.boards import Board
 from perception.sources.frame import Frame
-from probnerf.objects.tabletop_sampler import BODY_EXTENT
-from probnerf.types import BASE_Z
+from probnerf.types import BASE_Z, BODY_EXTENT
 
 _GRID = 48  # voxels per side of the carving
 _PX_PER_SQUARE = 40

@@ -7,14 +7,13 @@ import colorsys
 
 import numpy as np
 
-from probnerf.types import BASE_Z
+from probnerf.types import BASE_Z, BODY_EXTENT
 
 KINDS = ("can", "cup", "mug", "bowl", "bottle", "pitcher", "carton")
 CAN, CUP, MUG, BOWL, BOTTLE, PITCHER, CARTON = range(7)
 TEXTURES = ("plain", "banded", "labelled", "printed")
 PLAIN, BANDED, LABELLED, PRINTED = range(4)
 
-BODY_EXTENT = 1.4  # cube units
 REACH_LIMIT = 0.95  # no part's |x| exceeds this before slack, so that the cube holds it after
 SLACK_LOG_SCALE = 0.05  # standard deviations of the placement in the cube
 SLACK_SHIFT = 0.03

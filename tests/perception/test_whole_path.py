@@ -14,7 +14,6 @@ from perception.answers.query import query
 from perception.answers.regions import Box
 from perception.inference.controller import Estimate, estimate
 from perception.inference.settings import ControllerConfig
-from perception.observation.object_frame import BODY_EXTENT
 from perception.observation.segmentation import segment
 from perception.observation.settings import ObserveConfig
 from perception.simulation.sensor_faults import sense
@@ -25,6 +24,7 @@ from probnerf.likelihood.pixel_terms import faces_of_view, log_likelihood_one
 from probnerf.objects.cylinder_scenes import integrate, total_variation, yaw_histogram
 from probnerf.prior.checkpoint import Prior
 from probnerf.shapes import opacity_grids
+from probnerf.types import BODY_EXTENT
 
 HALF_EXTENT = 0.07  # m
 RADIUS, HANDLE = 0.45, 0.4  # cube units

@@ -9,7 +9,7 @@ import pytest
 
 from perception.inference.controller import estimate
 from perception.inference.settings import ControllerConfig
-from perception.observation.object_frame import BODY_EXTENT, ObjectFrame, object_frame
+from perception.observation.object_frame import ObjectFrame, object_frame
 from perception.observation.rays import calibration_widths, observe
 from perception.observation.segmentation import Segment, segment
 from perception.observation.settings import ObserveConfig
@@ -17,7 +17,7 @@ from perception.observation.visibility import inside_view, seen_voxels
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import read_frame_folder
 from probnerf.prior.checkpoint import load_prior
-from probnerf.types import BASE_Z, FREE, OBJECT, UNKNOWN, Observation
+from probnerf.types import BASE_Z, BODY_EXTENT, FREE, OBJECT, UNKNOWN, Observation
 from tests.perception.cylinders import CAN, Cylinder, looking_down, picture, to_camera, to_world
 
 CONFIG = ObserveConfig(colour_rays=192, free_rays=160, occluder_rays=32)

@@ -17,8 +17,8 @@ from probnerf.objects.tabletop import (
     sample_objects,
     signed_distance,
 )
-from probnerf.objects.tabletop_sampler import BODY_EXTENT, BOTTLE, CAN, CARTON, KINDS, MUG, PITCHER, REACH_LIMIT
-from probnerf.types import BASE_Z
+from probnerf.objects.tabletop_sampler import BOTTLE, CAN, CARTON, KINDS, MUG, PITCHER, REACH_LIMIT
+from probnerf.types import BASE_Z, BODY_EXTENT
 
 MANY = range(300)
 
