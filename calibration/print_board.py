@@ -1,23 +1,25 @@
 """Boards to print: PDF and PNG pages in true millimetres."""
 
-import struct
-import zlib
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
+from matplotlib.backends.backend_pdf import Name, PdfFile, RendererPdf
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as Outline
+from matplotlib.transforms import Affine2D
 
 from calibration.boards import Board
-from foundation.whole_file import write_whole
+from foundation.whole_file import whole_file
 
 Paper = Literal["A4", "A3", "letter"]
 PAPERS: dict[str, tuple[float, float]] = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}  # mm
 _MARGIN, _FOOT = 8.0, 8.0  # mm; what printers leave blank, and the strip with the ruler and the board's name
 _RULER = 100.0  # mm
 _PX_PER_MM = 12  # a whole number, so that the PNG states its resolution exactly
-_POINT = 25.4 / 72.0  # mm
+_INCH = 25.4  # mm
 
 
 def write_target(path: Path, board: Board, paper: Paper = "A4") -> None:
@@ -29,8 +31,9 @@ def write_target(path: Path, board: Board, paper: Paper = "A4") -> None:
         raise ValueError(f"{path} is neither .pdf nor .png; give a name with one of these endings")
     (width, height), dark = _page(board, paper)
     note = f"{board}   print at 100%, this line is {_RULER:g} mm, measure it"
-    encode = _pdf if path.suffix.lower() == ".pdf" else _png
-    write_whole(path, encode(width, height, dark, note))
+    write = _write_pdf if path.suffix.lower() == ".pdf" else _write_png
+    with whole_file(path) as part:
+        write(part, width, height, dark, note)
 
 
 def _page(board: Board, paper: Paper) -> tuple[tuple[float, float], Float[np.ndarray, "n 4"]]:
@@ -59,42 +62,39 @@ def _fits(across: float, down: float, paper: str) -> bool:
     return across <= width - 2 * _MARGIN and down <= height - 2 * _MARGIN - _FOOT
 
 
-def _pdf(width: float, height: float, dark: Float[np.ndarray, "n 4"], note: str) -> bytes:
-    """One page of filled rectangles and a line of text; the user space is scaled to millimetres with y up."""
-    drawing = [f"q {1 / _POINT:.9f} 0 0 {1 / _POINT:.9f} 0 0 cm"]
-    drawing += [f"{x0:.4f} {height - y1:.4f} {x1 - x0:.4f} {y1 - y0:.4f} re" for x0, y0, x1, y1 in dark]
-    drawing += ["f Q", f"BT /F 8 Tf {_MARGIN / _POINT:.3f} {(_MARGIN + 2.0) / _POINT:.3f} Td ({note}) Tj ET"]
-    stream = "\n".join(drawing).encode("ascii")
-    objects = [
-        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
-        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
-        f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {width / _POINT:.4f} {height / _POINT:.4f}] /Contents 4 0 R"
-        " /Resources << /Font << /F << /Type /Font /Subtype /Type1 /BaseFont /Helvetica >> >> >> >>".encode(),
-        b"<< /Length %d >>\nstream\n%s\nendstream" % (len(stream), stream),
+def _drawn(width: float, height: float, dark: Float[np.ndarray, "n 4"], note: str) -> Figure:
+    """A page, mm; its axes are in mm too, y down."""
+    figure = Figure(figsize=(width / _INCH, height / _INCH))
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0), frame_on=False, xticks=(), yticks=())
+    rectangles = [
+        Outline.unit_rectangle().transformed(Affine2D().scale(x1 - x0, y1 - y0).translate(x0, y0))
+        for x0, y0, x1, y1 in dark
     ]
-    data, offsets = b"%PDF-1.6\n", []
-    for number, content in enumerate(objects, start=1):
-        offsets.append(len(data))
-        data += b"%d 0 obj\n%s\nendobj\n" % (number, content)
-    table = b"".join(b"%010d 00000 n \n" % offset for offset in offsets)
-    data += b"xref\n0 %d\n0000000000 65535 f \n%s" % (len(objects) + 1, table)
-    start = data.index(b"xref\n0 ")
-    return data + b"trailer\n<< /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (len(objects) + 1, start)
+    # One path, so that no seam shows where two touch; not snapped to pixels, so that no edge is rounded away.
+    axes.add_patch(PathPatch(Outline.make_compound_path(*rectangles), color="black", linewidth=0, snap=False))
+    axes.text(_MARGIN, height - _MARGIN - 2.0, note, fontsize=8)
+    return figure
 
 
-def _png(width: float, height: float, dark: Float[np.ndarray, "n 4"], note: str) -> bytes:
-    """The page in grey. A pixel that an edge cuts is grey by the share that is dark, so no edge is rounded away."""
-    columns, rows = round(width * _PX_PER_MM), round(height * _PX_PER_MM)
-    page = np.zeros((rows, columns), np.float32)
-    for x0, y0, x1, y1 in dark * _PX_PER_MM:
-        top, bottom, left, right = int(y0), int(np.ceil(y1)), int(x0), int(np.ceil(x1))
-        over = np.clip(np.minimum(np.arange(left, right) + 1, x1) - np.maximum(np.arange(left, right), x0), 0, 1)
-        down = np.clip(np.minimum(np.arange(top, bottom) + 1, y1) - np.maximum(np.arange(top, bottom), y0), 0, 1)
-        page[top:bottom, left:right] += np.outer(down, over)
-    image: UInt8[np.ndarray, "h w"] = np.rint(255 * (1 - np.minimum(page, 1))).astype(np.uint8)
-    at = (round(_MARGIN * _PX_PER_MM), round((height - _MARGIN - 2.0) * _PX_PER_MM))
-    cv2.putText(image, note, at, cv2.FONT_HERSHEY_SIMPLEX, 0.9, 0, 2, cv2.LINE_AA)
-    data = cv2.imencode(".png", image)[1].tobytes()
-    # OpenCV writes no resolution: a pHYs chunk (pixels per metre) goes after the header, which has 33 bytes.
-    content = b"pHYs" + struct.pack(">IIB", _PX_PER_MM * 1000, _PX_PER_MM * 1000, 1)
-    return data[:33] + struct.pack(">I", 9) + content + struct.pack(">I", zlib.crc32(content)) + data[33:]
+def _write_pdf(path: Path, width: float, height: float, dark: Float[np.ndarray, "n 4"], note: str) -> None:
+    figure = _drawn(width, height, dark, note)
+    figure.dpi = 72.0
+    file = PdfFile(path, metadata={"CreationDate": None})
+    try:
+        file.newPage(*figure.get_size_inches())
+        renderer = RendererPdf(file, figure.dpi, height / _INCH, width / _INCH)
+        figure.draw(renderer)
+        renderer.finalize()
+        file.endStream()
+        # the catalogue again, so that viewers print at 100%
+        catalogue = {"Type": Name("Catalog"), "Pages": file.pagesObject}
+        file.writeObject(file.rootObject, {**catalogue, "ViewerPreferences": {"PrintScaling": Name("None")}})
+        file.finalize()
+    finally:
+        file.close()
+
+
+def _write_png(path: Path, width: float, height: float, dark: Float[np.ndarray, "n 4"], note: str) -> None:
+    """A pixel that an edge cuts is grey by the share that is dark."""
+    width, height = round(width * _PX_PER_MM) / _PX_PER_MM, round(height * _PX_PER_MM) / _PX_PER_MM  # whole pixels
+    _drawn(width, height, dark, note).savefig(path, format="png", dpi=_PX_PER_MM * _INCH)

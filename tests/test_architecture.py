@@ -104,7 +104,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "trimesh": ("perception/answers/regions.py", "benchmarks/scenes/meshes.py"),
     "rich": ("node/*", "benchmarks/*"),
     "PIL": ("node/figures/turning.py",),  # GIF
-    "matplotlib": ("node/figures/*", "benchmarks/*"),
+    "matplotlib": ("calibration/print_board.py", "node/figures/*", "benchmarks/*"),
 }
 
 CAN_EXECUTE_CODE = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve"}

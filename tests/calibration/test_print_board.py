@@ -2,6 +2,7 @@
 
 import re
 import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -24,8 +25,8 @@ def test_a_png_has_true_millimetres(tmp_path: Path, text: str, paper: Paper) -> 
     data = path.read_bytes()
     at = data.index(b"pHYs")
     per_metre_x, per_metre_y, unit = struct.unpack(">IIB", data[at + 4 : at + 13])
-    assert per_metre_x == per_metre_y and unit == 1 and at == 37  # before the pixels
-    page = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert per_metre_x == per_metre_y and unit == 1 and at < data.index(b"IDAT")
+    page = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     size = np.array(page.shape[::-1]) / per_metre_x * 1000
     np.testing.assert_allclose(sorted(size), PAPERS[paper], atol=0.05)
     points, pixels = board.find(page)
@@ -45,17 +46,21 @@ def test_a_pdf_has_true_millimetres(tmp_path: Path, text: str, paper: Paper) -> 
     write_target(path, board, paper)
     data = path.read_bytes()
     assert data.startswith(b"%PDF-1.") and data.endswith(b"%%EOF\n")
-    # Every offset of the table leads to its object, and the stream is as long as it says.
+    # The catalogue that the table leads to asks viewers not to scale.
     start = int(data.split(b"startxref\n")[1].split()[0])
-    offsets = [int(line[:10]) for line in data[start:].split(b"\n") if line.endswith(b" 00000 n ")]
-    assert [data[o:].split()[0] for o in offsets] == [b"1", b"2", b"3", b"4"]
-    length = int(re.search(rb"/Length (\d+)", data)[1])
-    stream = data.split(b"stream\n", 1)[1].split(b"\nendstream")[0]
-    assert len(stream) == length
-    box = np.array(re.search(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", data).groups(), float) * POINT
+    offsets = [int(offset) for offset in re.findall(rb"^(\d{10}) \d{5} [nf]", data[start:], re.M)]
+    root = int(re.search(rb"/Root (\d+) 0 R", data)[1])
+    catalogue = data[offsets[root] :].split(b"endobj")[0]
+    assert catalogue.startswith(b"%d 0 obj" % root) and re.search(rb"/PrintScaling\s*/None", catalogue)
+    box = np.array(re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", data).groups(), float) * POINT
     np.testing.assert_allclose(sorted(box), PAPERS[paper], atol=1e-3)
-    scale = float(re.search(rb"q ([\d.]+) 0 0 ([\d.]+) 0 0 cm", stream)[1]) * POINT  # mm per user unit
-    rectangles = np.array([line.split()[:4] for line in stream.split(b"\n") if line.endswith(b" re")], float) * scale
+    page = zlib.decompress(data.split(b"stream\n", 1)[1].split(b"\nendstream")[0])
+    number = rb"(-?[\d.]+)"
+    side = rb"\s+" + number + rb" " + number + rb" l"
+    corners = re.findall(number + rb" " + number + rb" m" + 3 * side + rb"\s+(?:[\d. l]+)?h", page)
+    quads = np.array(corners, float).reshape(-1, 4, 2) * POINT
+    quads = quads[(np.ptp(quads, axis=1) < box - 1.0).any(axis=1)]  # without the page's own
+    rectangles = np.hstack([quads.min(axis=1), np.ptp(quads, axis=1)])
     dark, ruler = rectangles[:-1], rectangles[-1]
     assert ruler[2] == pytest.approx(100.0, abs=1e-3)
     # y is up in a PDF and down on a board.
