@@ -5,7 +5,7 @@ PYTHON ?= $(shell for p in python3.11 python3 python3.12 python3.13; do \
 BIN := .venv/bin
 ARGS ?=
 
-.PHONY: help setup run test slow smoke format lock clean
+.PHONY: help setup run test slow smoke docs format lock clean
 .DEFAULT_GOAL := help
 
 help:
@@ -13,6 +13,7 @@ help:
 	@echo 'make test    set up if needed, then lint, format check, types and the default tests'
 	@echo 'make slow    the statistical tests of minutes'
 	@echo 'make smoke   build the wheel, install it into an empty environment, and use it there'
+	@echo 'make docs    build the documentation into site/'
 	@echo 'make format  sort imports and format every file'
 	@echo 'make lock    write requirements.lock again (ARGS=--upgrade moves every version)'
 	@echo 'make setup   only set up'
@@ -34,6 +35,10 @@ slow: setup
 smoke: setup
 	.ci/smoke
 
+# Material's banner about a later mkdocs would be taken for a warning by readers.
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
 format: setup
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -44,7 +49,7 @@ lock: setup
 		--generate-hashes --custom-compile-command 'make lock' --quiet --output-file requirements.lock $(ARGS)
 
 clean:
-	rm -rf .venv probnerf/kernel/*.so .jax_cache .hypothesis .mypy_cache .pytest_cache .ruff_cache *.egg-info
+	rm -rf .venv site probnerf/kernel/*.so .jax_cache .hypothesis .mypy_cache .pytest_cache .ruff_cache *.egg-info
 
 setup: .venv/.installed .venv/.kernel
 

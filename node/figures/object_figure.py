@@ -15,7 +15,7 @@ from foundation.whole_file import whole_file
 from node.figures import voxel_renderer
 from node.figures.summary import answer, diagnostics, figures, warnings
 from perception.answers.hypotheses import Hypotheses
-from perception.answers.summary import summarise
+from perception.answers.summary import sticks_out, summarise
 from perception.observation.segmentation import Segment
 from perception.sources.frame import Frame
 from probnerf.types import BASE_Z, UNKNOWN
@@ -41,7 +41,7 @@ def draw_object(path: Path, h: Hypotheses, frame: Frame | None = None, segment: 
         ax.set_yticks([])
         ax.spines[:].set_visible(False)
     _draw_view(axes[0, 0], axes[1, 0], h, frame, segment)
-    chosen, shares = representatives(h.solid, h.weights, SHOWN)
+    chosen, shares = shown(h, SHOWN)
     for column, (index, share) in enumerate(zip(chosen, shares, strict=True), start=1):
         for row, view in enumerate((front, back)):
             picture = voxel_renderer.shade(h, h.solid[index], view, float(h.base[index]))
@@ -80,6 +80,23 @@ def draw_training(path: Path, history: list[dict[str, float]]) -> None:
         ax.set_xlabel("step")
         ax.grid(alpha=0.25)
     save_figure(figure, path)
+
+
+def shown(h: Hypotheses, count: int) -> tuple[Int[np.ndarray, "k"], Float[np.ndarray, "k"]]:
+    """Up to `count` hypotheses that stand for all, and the share of the weight that each stands for.
+
+    Those with a hidden part that sticks out (`sticks_out`) and those without are shown by their weight, one of each at
+    least: they are what differs most for a planner, and `representatives` alone may pass over a thin part.
+    """
+    out, index, shares = sticks_out(h), np.zeros(0, int), np.zeros(0)
+    weight = float(h.weights[out].sum())
+    few = int(np.clip(round(count * weight), 1, count - 1)) if 0.0 < weight < 1.0 else round(count * weight)
+    for group, most in ((~out, count - few), (out, few)):
+        rows = np.flatnonzero(group & (h.weights > 0.0))
+        if len(rows) and most:
+            chosen, share = representatives(h.solid[rows], h.weights[rows], most)
+            index, shares = np.append(index, rows[chosen]), np.append(shares, share)
+    return index, shares
 
 
 def representatives(

@@ -4,20 +4,18 @@ import os
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 
 from node.figures import voxel_renderer
-from node.figures.object_figure import representatives
+from node.figures.object_figure import SHOWN, shown
 from perception.answers.hypotheses import Hypotheses
-from perception.answers.summary import sticks_out
 from perception.sources.frame import Frame
 
-SHOWN = 4  # hypotheses
 _PIXELS = 164  # of a panel's side
 _LABEL = 22  # px under a panel
 _TURN_MS = 4000  # one turn
-_COLOURS = 64  # of the palette that all frames share
+_COLOURS = 160  # of the palette that all frames share
 
 
 def draw_turning(path: Path, h: Hypotheses, frame: Frame | None = None, steps: int = 36) -> None:
@@ -36,7 +34,8 @@ def draw_turning(path: Path, h: Hypotheses, frame: Frame | None = None, steps: i
     for view in voxel_renderer.orbit(h.object_frame, _PIXELS, steps):
         shapes = [voxel_renderer.shade(h, h.solid[i], view, float(h.base[i])) for i in index]
         pictures.append(_labelled(np.concatenate([*panels, *shapes], axis=1), labels))
-    palette = pictures[0].quantize(_COLOURS)
+    sides = np.concatenate([np.asarray(pictures[0]), np.asarray(pictures[steps // 2])])
+    palette = Image.fromarray(sides).quantize(_COLOURS)
     frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
@@ -47,23 +46,6 @@ def draw_turning(path: Path, h: Hypotheses, frame: Frame | None = None, steps: i
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
-
-
-def shown(h: Hypotheses, count: int) -> tuple[Int[np.ndarray, "k"], Float[np.ndarray, "k"]]:
-    """Up to `count` hypotheses that stand for all, and the share of the weight that each stands for.
-
-    Those with a hidden part that sticks out (`sticks_out`) and those without are shown by their weight, one of each at
-    least: they are what differs most for a planner, and `representatives` alone may pass over a thin part.
-    """
-    out, index, shares = sticks_out(h), np.zeros(0, int), np.zeros(0)
-    weight = float(h.weights[out].sum())
-    few = int(np.clip(round(count * weight), 1, count - 1)) if 0.0 < weight < 1.0 else round(count * weight)
-    for group, most in ((~out, count - few), (out, few)):
-        rows = np.flatnonzero(group & (h.weights > 0.0))
-        if len(rows) and most:
-            chosen, share = representatives(h.solid[rows], h.weights[rows], most)
-            index, shares = np.append(index, rows[chosen]), np.append(shares, share)
-    return index, shares
 
 
 def _labelled(row: Float[np.ndarray, "s w 3"], labels: list[str]) -> Image.Image:

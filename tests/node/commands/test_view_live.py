@@ -48,7 +48,7 @@ def test_a_node_tells_its_camera_under_its_own_name() -> None:
     [
         ([], "give either FILE"),
         (["a.npz", "--live", "tcp/127.0.0.1:1"], "give either FILE"),
-        (["--live", "tcp/127.0.0.1:1", "--out", "a.png"], "leave it away with --live"),
+        (["--live", "tcp/127.0.0.1:1", "--out", "a.png"], "omit it with --live"),
         (["--live", "udp/127.0.0.1:1"], "'udp/127.0.0.1:1' is not tcp/address:port"),
     ],
 )
