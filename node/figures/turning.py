@@ -1,12 +1,12 @@
 """A moving picture (GIF): the view, and beside it some of the hypotheses turning about the object's upright axis."""
 
-import os
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 
+from foundation.whole_file import whole_file
 from node.figures import voxel_renderer
 from node.figures.object_figure import SHOWN, shown
 from perception.answers.hypotheses import Hypotheses
@@ -37,15 +37,10 @@ def draw_turning(path: Path, h: Hypotheses, frame: Frame | None = None, steps: i
     sides = np.concatenate([np.asarray(pictures[0]), np.asarray(pictures[steps // 2])])
     palette = Image.fromarray(sides).quantize(_COLOURS)
     frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with whole_file(path) as part:
         frames[0].save(
             part, "GIF", save_all=True, append_images=frames[1:], duration=_TURN_MS // steps, loop=0, optimize=True
         )
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _labelled(row: Float[np.ndarray, "s w 3"], labels: list[str]) -> Image.Image:
