@@ -99,7 +99,8 @@ def test_poses_are_undone_and_compose(first: Pose, second: Pose, seed: int) -> N
     np.testing.assert_allclose(first.to_object(jnp.asarray(to_view(first, p))), p, atol=2e-5)
     # One after the other they are one pose, whose place is the first one's moved by the second.
     x, y, z = to_view(second, to_view(first, np.array([0.0, 0.0, BASE_Z]))) - [0.0, 0.0, BASE_Z]
-    both = Pose(first.yaw + second.yaw, *map(jnp.float32, (x, y)), first.log_scale + second.log_scale, jnp.float32(z))
+    at = jnp.array([x, y, z], jnp.float32)
+    both = Pose(first.yaw + second.yaw, at[0], at[1], first.log_scale + second.log_scale, at[2])
     one_by_one = first.to_object(second.to_object(jnp.asarray(p)))
     np.testing.assert_allclose(both.to_object(jnp.asarray(p)), one_by_one, atol=1e-4)
     # A direction is the difference of two points, but for its length.

@@ -10,7 +10,7 @@ import pytest
 import perception.inference.tracker
 from perception.answers.hypotheses import Hypotheses
 from perception.inference.controller import Estimate
-from perception.inference.publish import View
+from perception.inference.publish import ConditionedView
 from perception.inference.settings import ControllerConfig, TrackConfig
 from perception.inference.tracker import Tracker
 from perception.observation.rays import observe
@@ -72,11 +72,11 @@ def test_a_cube_seen_from_another_camera_is_the_same_cube() -> None:
 
 
 @pytest.fixture
-def given(monkeypatch: pytest.MonkeyPatch) -> list[View]:
+def given(monkeypatch: pytest.MonkeyPatch) -> list[ConditionedView]:
     """The views that inference was asked of. In its place any shape is the answer, at once; it explains any frame."""
-    views: list[View] = []
+    views: list[ConditionedView] = []
 
-    def infer_view(view: View, prior: Prior, config: ControllerConfig, **asked: Any) -> Estimate:
+    def infer_view(view: ConditionedView, prior: Prior, config: ControllerConfig, **asked: Any) -> Estimate:
         views.append(view)
         h = _object([_fill(BODY)], [1.0], object_id=view.segment.id)
         h = replace(h, object_frame=view.object_frame, T_world_camera=view.frame.T_world_camera, seen=view.seen)
@@ -108,7 +108,7 @@ def around(azimuth: float, *cans: Cylinder, label: bool = True, stamp_ns: int = 
     return replace(picture(*cans, T=T, label=label), T_world_camera=T, stamp_ns=stamp_ns)
 
 
-def test_things_keep_their_names_and_places_wherever_the_camera_goes(given: list[View]) -> None:
+def test_things_keep_their_names_and_places_wherever_the_camera_goes(given: list[ConditionedView]) -> None:
     """What stands still in the world is the same thing from everywhere, though nothing but its place tells."""
     tracker, two = tracker_of(), (CAN, Cylinder(0.2, 0.1, 0.035, 0.1))
     places: dict[int, list[np.ndarray]] = {}
@@ -130,7 +130,7 @@ def test_things_keep_their_names_and_places_wherever_the_camera_goes(given: list
     assert np.linalg.norm(apart) == pytest.approx(np.hypot(0.2, 0.1), abs=0.02)
 
 
-def test_near_views_replace_each_other_and_far_ones_add_up_to_the_limit(given: list[View]) -> None:
+def test_near_views_replace_each_other_and_far_ones_add_up_to_the_limit(given: list[ConditionedView]) -> None:
     tracker = tracker_of(views=3, apart=15.0)
     azimuths, count = (0.0, 5.0, 60.0, 120.0, 180.0, 178.0), (1, 1, 2, 3, 3, 3)
     for i, azimuth in enumerate(azimuths):
@@ -146,7 +146,7 @@ def test_near_views_replace_each_other_and_far_ones_add_up_to_the_limit(given: l
 
 
 @pytest.mark.parametrize(("part", "change"), [(0.5, "view"), (2.0, "moved")])
-def test_a_plane_that_moved_says_that_the_camera_did(given: list[View], part: float, change: str) -> None:
+def test_a_plane_that_moved_says_that_the_camera_did(given: list[ConditionedView], part: float, change: str) -> None:
     """Where the camera does not know its place."""
     config = TrackConfig()
     raised, tilted = looking_down(), looking_down(35.0 + part * config.plane_degrees)
