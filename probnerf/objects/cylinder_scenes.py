@@ -110,6 +110,7 @@ def object_first(observation: Observation, colour_count: int) -> Observation:
     return replace(sorted_rays, pose_sigma=observation.pose_sigma, colour_count=colour_count)
 
 
+CHUNK = 512  # positions whose likelihood is evaluated at a time
 YAW_OF = {"seen": 60.0, "hidden": 180.0, "half": -70.0}  # degrees; "half": the left half, with the handle, is unknown
 
 
@@ -146,6 +147,7 @@ class GridPosterior:
     """The posterior over yaw, z_0 (handle length) and z_1 (radius) on a grid that is refined where mass is."""
 
     cells: np.ndarray  # f64[c, 3] (yaw in [0, 2 pi), z_0, z_1) of the centres
+    widths: np.ndarray  # f64[3] of every cell
     probability: np.ndarray  # f64[c], sums to 1
     log_likelihood: np.ndarray  # f64[c] of the pixels
     log_evidence: float
@@ -154,6 +156,24 @@ class GridPosterior:
     def histogram(self, bins: int = 12) -> np.ndarray:
         """Probability of each of `bins` equal arcs of yaw, from 0."""
         return yaw_histogram(self.cells[:, 0], self.probability, bins)
+
+    def draw(
+        self,
+        rng: np.random.Generator,
+        count: int,
+        log_likelihood: Callable[[Any, Float[Array, "p d"]], Float[Array, "p"]],
+        args: Any,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`count` points (yaw, z_0, z_1) and their weights, which stand for the posterior inside the cells, too.
+
+        They are drawn evenly within cells and weighed by the density there. `integrate` leaves a cell wide along what
+        moves neither yaw nor evidence, such as a hidden handle's length.
+        """
+        chosen = rng.choice(len(self.cells), count, p=self.probability)
+        points = self.cells[chosen] + (rng.random((count, 3)) - 0.5) * self.widths
+        log_density = _evaluate(log_likelihood, args, CHUNK, points) - 0.5 * np.sum(points[:, 1:] ** 2, axis=1)
+        weight = np.exp(log_density - log_density.max()) / self.probability[chosen]
+        return points, weight / weight.sum()
 
 
 def yaw_histogram(yaw: np.ndarray, probability: np.ndarray, bins: int = 12) -> np.ndarray:
@@ -173,7 +193,7 @@ def integrate(
     tolerance: float = 0.01,
     bins: int = 12,
     reach: float = 4.0,
-    chunk: int = 512,
+    chunk: int = CHUNK,
 ) -> GridPosterior:
     """Midpoint rule on cells that are halved along one axis after the other while that moves the answer.
 
@@ -188,7 +208,7 @@ def integrate(
         top = log_density.max()
         mass = np.exp(log_density - top)
         log_evidence = float(top + np.log(mass.sum() * widths.prod()) - 2 * np.log(2 * np.pi))
-        return GridPosterior(cells, mass / mass.sum(), value, log_evidence, len(cells))
+        return GridPosterior(cells, widths, mass / mass.sum(), value, log_evidence, len(cells))
 
     counts = np.array([36, 6, 24])
     widths = np.array([2 * np.pi, 2 * reach, 2 * reach]) / counts

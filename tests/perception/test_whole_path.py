@@ -81,22 +81,24 @@ def test_a_handle_s_angle_and_the_space_behind_are_what_brute_force_says(degrees
         observation, likelihood = found.observation, found.likelihood
         assert not np.asarray(observation.pose_sigma).any()
         assert found.object_frame.half_extent == pytest.approx(HALF_EXTENT, rel=0.05)
-        grid = integrate(_each, (MODEL, likelihood, observation, faces_of_view(observation, likelihood)))
+        args = (MODEL, likelihood, observation, faces_of_view(observation, likelihood))
+        grid = integrate(_each, args)
         distances.append(total_variation(yaws(found), grid.histogram()))
-        # the same box behind it, asked of as many shapes of the grid's posterior
-        rng = np.random.default_rng(0)
-        cells = grid.cells[rng.choice(len(grid.cells), CONFIG.hypotheses, p=grid.probability)]
-        yaw, z = cells[:, :1], cells[:, 1:]
-        drawn = np.concatenate([z, np.cos(yaw), np.sin(yaw), np.zeros((len(cells), 5))], axis=1)
+        # The same box behind it, asked of shapes of the posterior that the grid finds. Its cells' centres will not do:
+        # the handle's length is hidden, cells are 1.3 standard deviations wide along it, and their few lengths call the
+        # box free with 0.06 too much.
+        points, weights = grid.draw(np.random.default_rng(0), 4 * CONFIG.hypotheses, _each, args)
+        yaw, z = points[:, :1], points[:, 1:]
+        drawn = np.concatenate([z, np.cos(yaw), np.sin(yaw), np.zeros((len(points), 5))], axis=1)
         h = found.hypotheses
         asked = jnp.ones((CONFIG.grid,) * 3, bool)
         opacity = opacity_grids(MODEL, likelihood, jnp.asarray(drawn, jnp.float32), observation.pose_sigma, asked)
         by_grid = replace(
             h,
             opacity=np.asarray(opacity),
-            weights=np.full(len(cells), 1.0 / len(cells)),
-            population=np.zeros(len(cells), np.int32),
-            pose=np.zeros((len(cells), 5), np.float32),
+            weights=weights,
+            population=np.zeros(len(points), np.int32),
+            pose=np.zeros((len(points), 5), np.float32),
         )
         low, high = np.array([[-0.8, 0.15, -0.2], [-RADIUS - 0.15, 0.25, 0.1]]) * HALF_EXTENT
         box = Box(tuple(low), tuple(high))
@@ -104,7 +106,7 @@ def test_a_handle_s_angle_and_the_space_behind_are_what_brute_force_says(degrees
     print(f"handle at {degrees:g} degrees: total variation of its angle {distances}, P(free) behind {behind}")
     assert np.mean(distances) <= 0.1
     sampled, exact = np.mean(behind, axis=0)
-    assert sampled == pytest.approx(exact, abs=0.08)
+    assert sampled == pytest.approx(exact, abs=0.05)  # four standard errors of eight seeds' mean
     if degrees == 60.0:  # it is seen, and so is where it is not
         assert np.mean([yaws(found)[1:3].sum() for found in answers]) > 0.9 and sampled > 0.95
     else:

@@ -74,6 +74,15 @@ def test_the_grid_integrates_what_is_known_in_closed_form():
     assert total_variation(grid.histogram(), yaw_histogram(fine, density / density.sum())) < 0.005
     mean = grid.probability @ grid.cells
     np.testing.assert_allclose(mean, [1.3, 0.0, centre / (1 + width**2)], atol=2e-3)
+    # Along z_0 cells are as wide as the posterior: centres miss its distribution, and draws do not.
+    deviation = 1.1**-0.5
+    assert grid.widths[0] < 0.2 and grid.widths[1] > deviation
+    points, w = grid.draw(np.random.default_rng(0), 4096, known, (concentration, centre, width))
+    assert w.sum() == pytest.approx(1.0)
+    error = 4.5 * 0.5 * np.sqrt(np.sum(w**2))
+    for share, quantile in ((0.6, 0.2533), (0.75, 0.6745), (0.9, 1.2816)):
+        assert w[points[:, 1] < quantile * deviation].sum() == pytest.approx(share, abs=error)
+    assert abs(grid.probability[grid.cells[:, 1] < 0.2533 * deviation].sum() - 0.6) > 2.0 * error
 
 
 def test_pixels_are_drawn_from_the_density_that_scores_them():
