@@ -23,7 +23,7 @@ from probnerf.sampling.modes import mixture_of_modes
 from probnerf.sampling.populations import start_from
 from probnerf.sampling.tempered_smc import tempered_smc
 from probnerf.settings import InferConfig, TemperedSMCConfig
-from probnerf.types import Diagnostics, Observation, Posterior, on_device
+from probnerf.types import Diagnostics, Observation, Posterior, StopReason, on_device
 
 _log_likelihood = program()(log_likelihood)
 
@@ -180,4 +180,4 @@ def encoder_guess(
     diagnostics = Diagnostics(nan, zero, nan, ess, zero, zero, none, on_device(np.zeros(1)), on_device([np.nan]))
     likelihoods, population = on_device(values), on_device(np.zeros(len(values)), np.int32)
     weights = on_device(log_weights)
-    return Posterior(positions, weights, likelihoods, nans, population, nan, nan, diagnostics, "underway")
+    return Posterior(positions, weights, likelihoods, nans, population, nan, nan, diagnostics, StopReason.UNDERWAY)

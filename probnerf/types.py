@@ -5,6 +5,7 @@ one unit = `half_extent` metres of the ObjectFrame. The support plane is z = BAS
 """
 
 from collections.abc import Sequence
+from enum import StrEnum
 from typing import Any
 
 import equinox as eqx
@@ -111,6 +112,21 @@ class Pose(eqx.Module):
         return jnp.stack([c * u + s * v, -s * u + c * v, directions[..., 2] * jnp.ones_like(c)], axis=-1)
 
 
+class StopReason(StrEnum):
+    """Why sampling ended where it did. The values are the words of files and messages."""
+
+    CONVERGED = "converged"  # the sampler did all that it had to do
+    BUDGET = "budget"  # no time was left for a further step
+    STAGES = "stages"  # as many stages as were asked for, or all of a fixed schedule
+    STOPPED = "stopped"  # by the callback that hears of each stage
+    INTERRUPTED = "interrupted"  # by Ctrl-C
+    UNDERWAY = "underway"  # it has not ended: better samples follow
+
+    @classmethod
+    def _missing_(cls, value: object) -> "StopReason":
+        raise ValueError(f"the reason why sampling stopped is {value!r}; it must be one of {', '.join(cls)}")
+
+
 class Diagnostics(eqx.Module):
     """What a sampler says of itself; trouble is a result that travels with the posterior."""
 
@@ -136,4 +152,4 @@ class Posterior(eqx.Module):
     log_evidence: Float[Array, ""]  # mean over populations, NaN for samplers that have none
     log_evidence_se: Float[Array, ""]
     diagnostics: Diagnostics
-    result: str = eqx.field(static=True)  # why it stopped: "converged", "budget", "stages", "stopped", "interrupted"
+    result: StopReason = eqx.field(static=True)

@@ -70,10 +70,8 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     # JAX is probnerf's; perception meets it only where arrays are handed over.
     "jax": (
         "probnerf/*",
-        "perception/observation/rays.py",
-        "perception/observation/encoder_crop.py",
-        "perception/inference/controller.py",
         "perception/inference/publish.py",
+        "perception/inference/view_sampler.py",
         "perception/inference/warm_up.py",
         "benchmarks/*",
     ),

@@ -14,6 +14,7 @@ from typing import Any
 
 from benchmarks.harness.machine import machine, revision
 from benchmarks.harness.progress import say
+from probnerf.types import StopReason
 
 FOLDER = Path(__file__).resolve().parent.parent / "results"  # one file a study
 Line = dict[str, Any]  # a row with all that it has in common with its run
@@ -72,7 +73,7 @@ def read_lines(path: Path) -> list[Line]:
 
 def refuse_cut(result: str) -> None:
     """Raises KeyboardInterrupt where one ended an answer, which the sampler keeps for itself: it is no measurement."""
-    if result == "interrupted":
+    if result == StopReason.INTERRUPTED:
         raise KeyboardInterrupt
 
 

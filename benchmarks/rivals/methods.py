@@ -39,7 +39,7 @@ from probnerf.sampling.modes import log_posterior
 from probnerf.sampling.populations import thin
 from probnerf.settings import AnnealedHMCConfig
 from probnerf.shapes import scaled_about
-from probnerf.types import Diagnostics, Observation, Posterior
+from probnerf.types import Diagnostics, Observation, Posterior, StopReason
 
 DEPTHS = ("RGB-D", "colour only")
 CONDITIONS = tuple(f"{handle}, {depth}" for handle in ("hidden", "informative") for depth in DEPTHS)
@@ -118,7 +118,7 @@ def weighted_posterior(positions: Float[Array, "s d"], weights: Float[np.ndarray
         nan, zero, nan, nan, zero, zero, jnp.asarray(np.float32(gradients)), jnp.ones(1), jnp.full(1, nan)
     )
     values, population = jnp.full(count, nan), jnp.zeros(count, jnp.int32)
-    return Posterior(positions, log_weights, values, values, population, nan, nan, diagnostics, "")
+    return Posterior(positions, log_weights, values, values, population, nan, nan, diagnostics, StopReason.CONVERGED)
 
 
 def _sampled(q: Question, posterior: Posterior, evaluations: float = 0.0) -> Sampled:
@@ -220,7 +220,7 @@ def _estimate(
         begun = time.monotonic()
         found = estimate(q.view.frame, q.view.segment, q.prior, config, seed=q.seed, **limits)
         seconds = time.monotonic() - begun
-        gradients = found.hypotheses.diagnostics["point_gradients"]
+        gradients = found.hypotheses.diagnostics.point_gradients
         cube, likelihood = found.object_frame, found.likelihood
         return Sampled(found.posterior, found.observation, likelihood, cube, float(gradients), seconds=seconds)
 

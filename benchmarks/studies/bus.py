@@ -26,9 +26,11 @@ from node.ros.messages import QUERY_REGION, header, image_message, make
 from node.ros.parameters import serve_parameters
 from node.ros.services import POINTS, Answers
 from node.ros.settings import BusConfig
+from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
 from perception.observation.object_frame import ObjectFrame
 from probnerf.rendering.occupancy import voxel_centres
+from probnerf.types import StopReason
 
 _IMAGE = "sensor_msgs/msg/Image"
 _GET = "rcl_interfaces/srv/GetParameters"
@@ -156,8 +158,8 @@ def _scene(count: int, grid: int = 64) -> Hypotheses:
         monte_carlo_error=0.0,
         prior_hash="",
         seed=0,
-        diagnostics={},
-        result="stages",
+        diagnostics=AnswerDiagnostics(),
+        result=StopReason.STAGES,
     )
 
 

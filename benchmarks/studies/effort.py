@@ -115,7 +115,7 @@ def main(options: Options) -> Summary:
         rng = np.random.default_rng([seed, view.seed, 31])
         boxes = random_boxes(scored_voxels(view.seen, rate), 1, rng)
         judged = score(view, Answer(coarsen(h.solid, GRID), h.weights, found.seconds), rate, boxes, rng)
-        cost = {"point_gradients": h.diagnostics["point_gradients"], "first_answer": times[0], "seconds": times[-1]}
+        cost = {"point_gradients": h.diagnostics.point_gradients, "first_answer": times[0], "seconds": times[-1]}
         parts = {part: found.parts.get(part, 0.0) for part in PARTS}
         return {**cost, **parts, "hidden_nll": judged.values["hidden_nll"]}, found
 

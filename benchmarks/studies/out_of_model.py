@@ -129,9 +129,9 @@ def _answered(
     boxes = random_boxes(scored, BOXES, np.random.default_rng([seed, view.seed, 31]))
     given = {"alone": Answer(coarsen(h.solid, GRID), h.weights, found.seconds), "queried": as_queried(h, found.seconds)}
     judged = {k: score(view, a, rate, boxes, np.random.default_rng(0)) for k, a in given.items()}
-    evidence = h.diagnostics["log_evidence"] / max(pixels, 1)
+    evidence = h.diagnostics.log_evidence / max(pixels, 1)
     return {
-        "explained": round(h.diagnostics["explained"], 4),
+        "explained": round(h.diagnostics.explained, 4),
         "evidence": round(evidence, 4) if np.isfinite(evidence) else -1e9,
         "flagged": bool(h.out_of_model),
         "seconds": round(found.seconds, 2),

@@ -23,8 +23,9 @@ from node.ros.scene_messages import DiagnosticStatus, Level
 from node.ros.services import Answers
 from node.ros.topic_source import TopicSource
 from perception.answers.hypotheses import Hypotheses
+from perception.inference.limits import Callbacks, Limits
 from perception.inference.schedule import config_hash, scheduled
-from perception.inference.tracker import Look, Tracker
+from perception.inference.tracker import Change, Look, Tracker
 from perception.inference.warm_up import warm_up
 from perception.observation.segmentation import Segment, segment
 from perception.sources.frame import Frame, Source
@@ -35,6 +36,7 @@ from perception.sources.recorder import Recorder
 from perception.sources.recording import Log
 from perception.sources.topic_names import TopicNames
 from probnerf.prior.checkpoint import load_prior
+from probnerf.types import StopReason
 
 HYPOTHESES_TOPIC = "/farside/hypotheses"
 STATUS_S = 1.0  # between diagnostics
@@ -233,19 +235,20 @@ class LiveNode:
                 continue
             if (now := time.monotonic()) >= self._until:
                 return
-            deadline = min(now + self.config.budget, self._until)
-            update = self.tracker.infer(look, deadline=deadline, on_answer=answered)
+            limits = Limits(deadline=min(now + self.config.budget, self._until))
+            update = self.tracker.infer(look, limits, Callbacks(on_answer=answered))
             self.inferences += 1
             h = update.hypotheses
             self._record(h, look)
-            said = {"new": "first seen", "moved": "has moved: begun anew", "view": "seen from another side"}
+            news = {Change.NEW: "first seen", Change.MOVED: "has moved: begun anew"}
+            news |= {Change.VIEW: "seen from another side", Change.CONTINUED: "sampling went on"}
             out.print(
-                f"object {h.object_id} {said.get(update.change, 'sampling went on')}: {h.result} at stage {h.stage},"
+                f"object {h.object_id} {news[update.change]}: {h.result} at stage {h.stage},"
                 f" effective hypotheses {h.effective_hypotheses:.1f}, error {h.monte_carlo_error:.3f}",
                 highlight=False,
                 soft_wrap=True,
             )
-            if h.result == "interrupted":  # the sampler took the Ctrl-C, which is meant for the whole node
+            if h.result == StopReason.INTERRUPTED:  # the sampler took the Ctrl-C, which is meant for the whole node
                 raise KeyboardInterrupt
 
     def _publish(self, frame: Frame, segments: dict[int, Segment]) -> None:
@@ -264,9 +267,7 @@ class LiveNode:
     def _record(self, h: Hypotheses, look: Look) -> None:
         if self.recorder is None:
             return
-        self.recorder.write_schedule(
-            scheduled(h, self._hash, "tracked" if look.change in ("view", "continued") else "fresh")
-        )
+        self.recorder.write_schedule(scheduled(h, self._hash, "tracked" if look.builds_on else "fresh"))
         message = hypotheses_message(h, self.config.controller.infer.method)
         data = bytes(encode(message))
         self.recorder.write_raw(HYPOTHESES_TOPIC, HYPOTHESES, definition(HYPOTHESES), data, h.stamp_ns)

@@ -31,6 +31,7 @@ from perception.sources.topic_names import TopicNames
 from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.sampling.hmc import StageInfo
 from probnerf.settings import Method
+from probnerf.types import StopReason
 
 BUDGET_S = 90.0
 PICTURE_S = 3.0  # of each object's share of the budget, kept back for its picture
@@ -131,7 +132,7 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
             if not is_source:
                 write_frame_folder(kept, frame)
         done.append(result.hypotheses)
-        if result.hypotheses.result == "interrupted":
+        if result.hypotheses.result == StopReason.INTERRUPTED:
             return False
     if not done:
         raise complaint

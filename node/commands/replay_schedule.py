@@ -7,6 +7,7 @@ from rich.console import Console
 
 from calibration.camera_file import read_camera
 from node.commands.replay import ReplayConfig, progress_of, publish
+from perception.inference.limits import Callbacks, Limits
 from perception.inference.schedule import config_hash, digest
 from perception.inference.tracker import Look, Tracker
 from perception.observation.segmentation import Segment, segment
@@ -15,6 +16,7 @@ from perception.sources.playback import Playback, open_playback
 from perception.sources.schedule_entry import Scheduled
 from perception.sources.settings import SHIPPED_LOG
 from probnerf.prior.checkpoint import Prior, load_prior
+from probnerf.types import StopReason
 
 
 def follow(config: ReplayConfig, out: Console, err: Console) -> bool:
@@ -55,12 +57,12 @@ def follow(config: ReplayConfig, out: Console, err: Console) -> bool:
             if entry not in wanted and frame.label is not None:
                 continue
             with progress_of(f"object {entry.object_id}", entry.stages, None, err) as on_stage:
-                update = tracker.infer(look, stages=entry.stages, on_stage=on_stage)
+                update = tracker.infer(look, Limits(stages=entry.stages), Callbacks(on_stage=on_stage))
             if entry not in wanted:
                 continue
             folder = config.folder / str(frame.stamp_ns)
             publish(folder, frame, found, update.hypotheses, update.seconds, out)
-            if update.hypotheses.result == "interrupted":
+            if update.hypotheses.result == StopReason.INTERRUPTED:
                 return False
             done += 1
             if digest(update.hypotheses) == entry.digest:

@@ -5,6 +5,7 @@ from jaxtyping import Float
 
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.summary import MARGIN_M, Direction, Summary
+from probnerf.types import StopReason
 
 CM3 = 1e6  # per cubic metre
 
@@ -50,7 +51,7 @@ def figures(h: Hypotheses) -> dict[str, str]:
 def diagnostics(h: Hypotheses) -> dict[str, str]:
     """Numbers about the sampler, for those who tune it."""
     d = h.diagnostics
-    evidence, error = d.get("log_evidence", np.nan), d.get("log_evidence_se", np.nan)
+    evidence, error = d.log_evidence, d.log_evidence_se
     populations = len(np.unique(h.population)) + h.failed
     return {
         "stopped": f"{h.result}, stage {h.stage}",
@@ -65,7 +66,7 @@ def diagnostics(h: Hypotheses) -> dict[str, str]:
 
 def unexplained(h: Hypotheses) -> str:
     """Why an answer that is flagged `out_of_model` is: the object, or too little time to tell."""
-    if h.result in ("converged", "underway"):
+    if h.result in (StopReason.CONVERGED, StopReason.UNDERWAY):
         return "out of model: no shape of the prior explains this view"
     return f"no shape found so far explains this view: the sampler was cut short ({h.result}); give it more time"
 
@@ -75,7 +76,7 @@ def warnings(h: Hypotheses) -> list[str]:
     lines = []
     if h.out_of_model:
         lines.append(f"{unexplained(h)}; queries answer with caution")
-    elif h.result == "budget":
+    elif h.result == StopReason.BUDGET:
         lines.append(
             "the time was up before the sampler converged: the answer is less certain than it can be; raise the budget"
         )

@@ -18,9 +18,11 @@ from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
 from foundation.one_line import one_line
+from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
 from perception.observation.object_frame import ObjectFrame
 from perception.sources.frame import Frame
+from probnerf.types import StopReason
 
 _HERE = Path(__file__).resolve()
 # Installed they lie inside this package, in a checkout where a ROS workspace takes them from.
@@ -243,7 +245,7 @@ def _numbers(values: Num[np.ndarray, "..."], dtype: str) -> Num[np.ndarray, "n"]
 
 def hypotheses_message(h: Hypotheses, method: str = "") -> Any:
     """Hypotheses as farside_msgs/ShapeHypotheses, complete: `hypotheses_from` gives them back."""
-    frame, known = h.object_frame, h.T_world_camera is not None
+    frame, known, numbers = h.object_frame, h.T_world_camera is not None, h.diagnostics.as_mapping()
     return make(
         HYPOTHESES,
         header=header(h.stamp_ns, h.frame_id),
@@ -268,13 +270,13 @@ def hypotheses_message(h: Hypotheses, method: str = "") -> Any:
         stage=int(h.stage),
         result=h.result,
         monte_carlo_error=float(h.monte_carlo_error),
-        explained=float(h.diagnostics.get("explained", np.nan)),
+        explained=float(h.diagnostics.explained),
         out_of_model=bool(h.out_of_model),
         inside_view=bool(h.inside_view),
         seed=int(h.seed),
         prior_hash=h.prior_hash,
-        diagnostic_names=list(h.diagnostics),
-        diagnostic_values=np.array(list(h.diagnostics.values()), np.float64),
+        diagnostic_names=list(numbers),
+        diagnostic_values=np.array(list(numbers.values()), np.float64),
     )
 
 
@@ -316,6 +318,6 @@ def hypotheses_from(message: Any) -> Hypotheses:
         monte_carlo_error=m.monte_carlo_error,
         prior_hash=m.prior_hash,
         seed=m.seed,
-        diagnostics=dict(zip(names, values, strict=True)),
-        result=m.result,
+        diagnostics=AnswerDiagnostics.from_mapping(dict(zip(names, values, strict=True))),
+        result=StopReason(m.result),
     )

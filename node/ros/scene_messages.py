@@ -196,7 +196,7 @@ def sampler_status(h: Hypotheses, now_ns: int) -> DiagnosticStatus:
     message = h.result if not h.out_of_model else f"{h.result}; {unexplained(h)}"
     age = (now_ns - h.stamp_ns) * 1e-9
     values = {"age (s)": age, "stage": h.stage, "monte carlo error": h.monte_carlo_error}
-    values |= {"effective hypotheses": h.effective_hypotheses, **h.diagnostics}
+    values |= {"effective hypotheses": h.effective_hypotheses, **h.diagnostics.as_mapping()}
     return DiagnosticStatus(f"farside: object {h.object_id}", "warn" if h.out_of_model else "ok", message, values)
 
 

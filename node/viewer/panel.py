@@ -12,6 +12,7 @@ from node.figures.query_answer import rows
 from node.figures.summary import warnings
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.query import QueryResult
+from probnerf.types import StopReason
 
 OCCUPIED = ("#fff1d6", "#fdbb84", "#ef6548", "#990000")  # p_occupied from 0 to 1
 DISAGREEMENT = ("#fde8ee", "#fa9fb5", "#c51b8a", "#49006a")  # entropy from 0 to log 2
@@ -31,10 +32,12 @@ LAYERS = {  # parts that can be hidden, and their scene nodes
 }
 FREE, BLOCKED = "#1a9850", "#d73027"
 _STOPPED = {
-    "converged": "the sampler finished",
-    "budget": "the time was up before the sampler had finished",
-    "stages": "stopped after as many stages as asked for",
-    "interrupted": "stopped by hand",
+    StopReason.CONVERGED: "the sampler finished",
+    StopReason.BUDGET: "the time was up before the sampler had finished",
+    StopReason.STAGES: "stopped after as many stages as asked for",
+    StopReason.STOPPED: "stopped by the program that asked",
+    StopReason.INTERRUPTED: "stopped by hand",
+    StopReason.UNDERWAY: "the sampler goes on",
 }
 
 
@@ -110,8 +113,7 @@ def state(scene: Sequence[Hypotheses], now_ns: int | None = None) -> str:
         lines += [f'<span style="color:#a04000">⚠ {escape(line)}</span>' for line in warnings(h)]
         if not warnings(h):
             lines.append(f'<span style="color:{FREE}">✓ no doubts raised</span>')
-        reason = _STOPPED.get(h.result, f"stopped: {escape(h.result)}")
-        lines.append(f"after stage {h.stage}; {reason}")
+        lines.append(f"after stage {h.stage}; {_STOPPED[h.result]}")
         lines.append(
             f"{len(h.weights)} hypotheses, {h.effective_hypotheses:.1f} effective; Monte Carlo error "
             f"±{h.monte_carlo_error:.3f} of the mean unseen occupancy"

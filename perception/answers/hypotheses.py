@@ -15,10 +15,11 @@ from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from scipy.special import entr
 from skimage.measure import marching_cubes
 
+from perception.answers.diagnostics import AnswerDiagnostics
 from perception.observation.object_frame import ObjectFrame
 from probnerf.geometry import rigid
 from probnerf.rendering.occupancy import above_plane, solid, voxel_centres, voxel_index, voxel_surface
-from probnerf.types import BASE_Z
+from probnerf.types import BASE_Z, StopReason
 
 FrameName = Literal["object", "camera", "world"]
 
@@ -44,8 +45,8 @@ class Hypotheses:
     monte_carlo_error: float  # standard error of the mean unseen occupancy
     prior_hash: str
     seed: int
-    diagnostics: dict[str, float]
-    result: str  # the sampler's (`Posterior.result`); "underway": better ones follow
+    diagnostics: AnswerDiagnostics
+    result: StopReason  # the sampler's (`Posterior.result`), or what kept the controller from a further run
 
     def __post_init__(self) -> None:
         shape = self.opacity.shape
@@ -129,7 +130,7 @@ class Hypotheses:
     @property
     def failed(self) -> int:
         """How many of the sampler's populations never left a poor mode, and are left out."""
-        return int(self.diagnostics.get("failed_populations", 0.0))
+        return int(np.nan_to_num(self.diagnostics.failed_populations))
 
     @property
     def alone(self) -> bool:

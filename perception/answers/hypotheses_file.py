@@ -1,9 +1,9 @@
 """The hypotheses file: what one object's `Hypotheses` are kept in, and a folder of them.
 
 The file is a NumPy `.npz` without pickles. `header` holds the UTF-8 bytes of a JSON object with `format` and the scalar
-fields of `Hypotheses` and of its ObjectFrame by their own names; the arrays `opacity`, `pose`, `weights`, `population`,
-`seen`, `T_camera_object`, `plane` and, where it is known, `T_world_camera` are the fields of those names. Equal content
-gives equal bytes.
+fields of `Hypotheses` and of its ObjectFrame by their own names, and with `diagnostics`, an object of numbers by name
+(`AnswerDiagnostics`); the arrays `opacity`, `pose`, `weights`, `population`, `seen`, `T_camera_object`, `plane` and,
+where it is known, `T_world_camera` are the fields of those names. Equal content gives equal bytes.
 """
 
 import itertools
@@ -16,8 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from foundation.whole_file import whole_file
+from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
 from perception.observation.object_frame import ObjectFrame
+from probnerf.types import StopReason
 
 FORMAT = "farside-hypotheses-"
 VERSION = 2  # 1: poses without z
@@ -53,7 +55,7 @@ def save(path: str | Path, hypotheses: Hypotheses) -> None:
         "monte_carlo_error": float(h.monte_carlo_error),
         "prior_hash": h.prior_hash,
         "seed": int(h.seed),
-        "diagnostics": {name: float(value) for name, value in h.diagnostics.items()},
+        "diagnostics": h.diagnostics.as_mapping(),
         "result": h.result,
     }
     arrays = {
@@ -175,6 +177,6 @@ def _from_file(header: dict, arrays: dict[str, np.ndarray]) -> Hypotheses:
         monte_carlo_error=header["monte_carlo_error"],
         prior_hash=header["prior_hash"],
         seed=header["seed"],
-        diagnostics=header["diagnostics"],
-        result=header["result"],
+        diagnostics=AnswerDiagnostics.from_mapping(header["diagnostics"]),
+        result=StopReason(header["result"]),
     )

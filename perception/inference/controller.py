@@ -14,35 +14,25 @@ no check told where (`farside bench frontier` has a coarse lattice among its lev
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from threading import RLock
 
-import jax
 import numpy as np
-from jaxtyping import Array
 
 from perception.answers.hypotheses import Hypotheses
+from perception.inference.limits import NO_CALLBACKS, NO_LIMITS, Callbacks, Limits
 from perception.inference.publish import ConditionedView, published
+from perception.inference.run_plan import Findings, runs_wanted
 from perception.inference.settings import ControllerConfig
-from perception.observation.encoder_crop import crop
+from perception.inference.view_sampler import ViewSampler
 from perception.observation.object_frame import ObjectFrame
 from perception.observation.rays import observe
 from perception.observation.segmentation import Segment
 from perception.observation.visibility import seen_voxels
 from perception.sources.frame import Frame
-from probnerf.inference import asks_encoder, crossings_of, encoder_guess, infer, likelihood_of, modes_of, sampler_of
 from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.checkpoint import Prior
-from probnerf.prior.networks import ProbNeRF
-from probnerf.prior.posterior_network import EncoderPicture
-from probnerf.sampling.gaussian_mixture import GaussianMixture
 from probnerf.sampling.hmc import StageInfo
 from probnerf.sampling.populations import pooled
-from probnerf.settings import TemperedSMCConfig
-from probnerf.types import Observation, Posterior
-
-# Two batches of eigenvalues may wait for each other for ever: each holds a thread of XLA's pool, one per core, until
-_ONE_AT_A_TIME = RLock()  # another thread of that pool has done its parts (jaxlib's ParallelBatchMap)
+from probnerf.types import Observation, Posterior, StopReason
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,20 +70,11 @@ def estimate(
     Raises ValueError where the segment cannot be observed (too small, outside the prior's range of sizes).
     """
     config = config or ControllerConfig()
-    begun = time.monotonic()
+    limits = Limits(None if budget_s is None else time.monotonic() + budget_s, stages)
     observation, cube = observe(frame, segment, config.observe, seed, known)
-    view = ConditionedView(frame, segment, observation, cube, seen_voxels(frame, segment, cube, config.grid))
-    return infer_view(
-        view,
-        prior,
-        config,
-        seed=seed,
-        pose_known=known is not None,
-        deadline=None if budget_s is None else begun + budget_s,
-        stages=stages,
-        on_stage=on_stage,
-        on_answer=on_answer,
-    )
+    seen = seen_voxels(frame, segment, cube, config.grid)
+    view = ConditionedView(frame, segment, observation, cube, seen, pose_known=known is not None)
+    return infer_view(view, prior, config, seed=seed, limits=limits, callbacks=Callbacks(on_stage, on_answer))
 
 
 def infer_view(
@@ -102,202 +83,116 @@ def infer_view(
     config: ControllerConfig,
     *,
     seed: int = 0,
-    pose_known: bool = False,
     before: Posterior | None = None,
-    fresh: bool = True,
-    deadline: float | None = None,
-    stages: int | None = None,
-    on_stage: Callable[[StageInfo], bool | None] | None = None,
-    on_answer: Callable[[Hypotheses], None] | None = None,
+    limits: Limits = NO_LIMITS,
+    callbacks: Callbacks = NO_CALLBACKS,
 ) -> Estimate:
-    """Sample the posterior of a view and publish it, in as many runs as it takes.
+    """Sample the posterior of a view and publish it, in as many runs as it takes (`run_plan.runs_wanted`).
 
-    `before` is a posterior of the same view that was cut short; one run goes on from it. `fresh`: nothing is known of
-    the object, so that the encoder's guess is worth handing out at once. `stages` and `deadline` are for all runs
+    `before` is a posterior of the same view that was cut short; one run goes on from it. The limits are for all runs
     together. A further run that is cut short is left out.
     """
     begun = time.monotonic()
-    work = _Work(view, prior, config, seed, pose_known, before, fresh, deadline, stages, on_stage, on_answer)
-    grows = before is None and config.infer.method == "tempered_smc"
-    runs: list[Posterior] = []  # whole ones, but for a first
-    log: list[str] = []
-    needed, answered = 1, 0
-    short: str | None = None
-    while short is None and len(runs) < needed:
-        posterior = work.sample(len(runs))
-        whole = posterior.result == "converged"
-        if whole or not runs:
-            runs.append(posterior)
-        if not whole:
-            short = posterior.result
-        elif len(runs) < needed:
-            short = work.short_of()
-        if short is None and len(runs) < needed:
-            continue
-        if len(runs) > answered:
-            h = work.answer = work.publish(pooled(runs, work.smc.evidence_power), config.hypotheses)
-            answered, missed = len(runs), 1.0 - h.diagnostics["explained"]
-            loss = h.diagnostics["expected_loss"]
-            told = f"expected loss {loss:.4f} nats" if np.isfinite(loss) else "expected loss not known"
-            told += f", {100 * missed:.0f}% of pixels not explained"
-            if h.failed:
-                told += f", populations that failed and are left out: {h.failed}"
-            log.append(f"{work.amount(answered)}: {told}")
-            if grows and short is None:
-                needed = config.needed(answered, loss, missed)
-            if short is None and needed > answered:
-                log[-1] += f" -> {work.amount(needed)}"
-                short = work.short_of()
-                if short is None and on_answer is not None:
-                    on_answer(replace(h, result="underway"))
-        if short is not None and len(runs) < needed:
-            log.append(f"no room for more ({short})")
-            work.answer, runs[-1] = replace(h, result=short, stage=work.stages), replace(runs[-1], result=short)
-    assert work.answer is not None
-    if on_answer is not None:
-        on_answer(work.answer)
-    found = pooled(runs, work.smc.evidence_power)
-    seconds = time.monotonic() - begun
-    work.turn_to("")
+    sampler = ViewSampler(view, prior, config.infer, seed, limits, before)
+    publisher = _Publisher(sampler, config, callbacks)
+    may_grow = before is None and config.infer.method == "tempered_smc"
+    if sampler.asks_encoder:
+        publisher.hand_out_guess()
+        sampler.climb()
+    runs: list[Posterior] = []
+    wanted, stop, log = 1, None, list[str]()
+    while stop is None and len(runs) < wanted:
+        new, stop = sampler.more_runs(len(runs), wanted, publisher.after_stage)
+        if new:
+            runs += new
+            answer = publisher.publish_runs(runs)
+            found = Findings(len(runs), answer.diagnostics.expected_loss, 1.0 - answer.diagnostics.explained)
+            if may_grow and stop is None:
+                wanted = runs_wanted(found, config.runs, config.tolerance, config.unexplained)
+            log.append(publisher.log_line(found, answer.failed, wanted if stop is None else len(runs)))
+        if stop is None and len(runs) < wanted:
+            stop = sampler.limit_reached()
+            if stop is None:  # better ones follow
+                publisher.hand_out(replace(answer, result=StopReason.UNDERWAY))
+    if stop is not None and len(runs) < wanted:
+        log.append(f"no room for more ({stop})")
+        answer, runs[-1] = replace(answer, result=stop, stage=sampler.stages), replace(runs[-1], result=stop)
+    publisher.hand_out(answer)
     return Estimate(
-        work.answer, found, work.likelihood, view.observation, view.object_frame, seconds, tuple(log), work.parts
+        hypotheses=answer,
+        posterior=pooled(runs, sampler.smc.evidence_power),
+        likelihood=sampler.likelihood,
+        observation=view.observation,
+        object_frame=view.object_frame,
+        seconds=time.monotonic() - begun,
+        log=tuple(log),
+        parts=sampler.stopwatch.seconds,
     )
 
 
 @dataclass(eq=False)
-class _Work:
-    """One view's sampling: what all runs share, and what they have cost."""
+class _Publisher:
+    """Makes hypotheses of a view's samples, and hands out early ones until the first run is whole."""
 
-    view: ConditionedView
-    prior: Prior
+    sampler: ViewSampler
     config: ControllerConfig
-    seed: int
-    pose_known: bool
-    before: Posterior | None
-    fresh: bool
-    deadline: float | None
-    cap: int | None  # stages
-    on_stage: Callable[[StageInfo], bool | None] | None
-    on_answer: Callable[[Hypotheses], None] | None
-    searched: bool = False
-    reference: GaussianMixture | None = None  # where all runs begin, if not at the prior
-    stages: int = 0  # done
-    point_gradients: float = 0.0
-    answer: Hypotheses | None = None  # of whole runs
-    answered: float = field(default_factory=time.monotonic)  # when the last one that was underway was given,
-    answering: float = 0.0  # s; and what it took
-    stage_s: list[float] = field(default_factory=list)  # s; each stage of the latest run
-    since: float = 0.0  # when the stage at hand began
-    parts: dict[str, float] = field(default_factory=dict)  # s; by what was done
-    part: str = ""  # what is being done
-    turned: float = field(default_factory=time.monotonic)  # since when
+    callbacks: Callbacks
+    _whole: bool = False  # a run is: no more early answers
+    _early_at: float = field(default_factory=time.monotonic)  # when the last early answer was handed out
+    _early_s: float = 0.0  # what it took to make
 
-    @cached_property
-    def likelihood(self) -> Likelihood:
-        return likelihood_of(self.config.infer, self.view.observation, not self.pose_known)
+    def publish_runs(self, runs: list[Posterior]) -> Hypotheses:
+        """The answer of several runs together."""
+        self._whole = True
+        return self._published(pooled(runs, self.sampler.smc.evidence_power), self.config.hypotheses)
 
-    @property
-    def smc(self) -> TemperedSMCConfig:
-        """Of one run."""
-        return sampler_of(self.config.infer, self.reference, self.before)
+    def hand_out(self, answer: Hypotheses) -> None:
+        """Pass an answer on, if anyone listens."""
+        if self.callbacks.on_answer is not None:
+            self.callbacks.on_answer(answer)
 
-    @cached_property
-    def picture(self) -> EncoderPicture | None:
-        """What the encoder sees. Without the ranges that it was trained with there is none, nor where the pose is known
-        (guesses at one yaw climb to poor modes): sampling begins at the prior.
+    def hand_out_guess(self) -> None:
+        """What the encoder takes the object for, if anyone listens who knows nothing better."""
+        if self.callbacks.on_answer is not None and self.callbacks.guess:
+            self._hand_out_early(self.sampler.guess())
+
+    def after_stage(self, info: StageInfo) -> bool | None:
+        """Pass a stage on, with an early answer of its samples where it is time for one; True ends the run.
+
+        The first comes at once. To make a later one may take a tenth of the time that went by since the one before.
         """
-        if self.pose_known or self.view.frame.depth is None or not isinstance(self.prior.model, ProbNeRF):
-            return None
-        return crop(self.view.frame, self.view.segment, self.view.object_frame, self.prior.model.preset.image_size)
-
-    def turn_to(self, part: str) -> None:
-        """What time goes to from now on; "": nothing that is counted."""
-        now = time.monotonic()
-        if self.part:
-            self.parts[self.part] = self.parts.get(self.part, 0.0) + now - self.turned
-        self.part, self.turned = part, now
-
-    def sample(self, run: int) -> Posterior:
-        """One run of `infer`; other threads' wait."""
-        with _ONE_AT_A_TIME:
-            return self._sampled(run)
-
-    def _sampled(self, run: int) -> Posterior:
-        observation = self.view.observation
-        key = jax.random.key(self.seed)
-        self.turn_to("climbing")
-        if not self.searched and self.before is None:
-            self._search(jax.random.fold_in(key, 1))
-        self.turn_to("sampling")
-        self.stage_s, self.since = [], time.monotonic()
-        posterior, likelihood = infer(
-            jax.random.fold_in(key, 10 + run) if run else key,
-            self.prior.model,
-            observation,
-            self.config.infer,
-            reference=self.reference,
-            before=self.before,
-            sample_pose=not self.pose_known,
-            on_stage=self._told,
-            deadline=self.deadline,
-            stages=None if self.cap is None else self.cap - self.stages,
-        )
-        self.turn_to("")
-        self.stages += int(posterior.diagnostics.stages)
-        self.point_gradients += float(posterior.diagnostics.point_gradients) * crossings_of(likelihood, observation)
-        return posterior
-
-    def _search(self, key: Array) -> None:
-        """Ask the encoder, hand out what it says where nothing better is known, and climb from there: once a view."""
-        self.searched, config, model = True, self.config.infer, self.prior.model
-        if config.method != "tempered_smc" or not asks_encoder(config, model, self.picture):
-            return
-        assert isinstance(model, ProbNeRF) and self.picture is not None
-        if self.on_answer is not None and self.fresh:
-            self._answer(encoder_guess(key, model, self.likelihood, self.view.observation, self.picture))
-        self.reference = jax.block_until_ready(modes_of(key, model, self.view.observation, config, self.picture))
-        climbed = config.modes.gradients(self.likelihood.dim(model))
-        self.point_gradients += climbed * crossings_of(self.likelihood, self.view.observation)
-
-    def _told(self, info: StageInfo) -> bool | None:
-        if self.on_stage is not None and self.on_stage(replace(info, stage=self.stages + info.stage)):
+        if self.callbacks.on_stage is not None and self.callbacks.on_stage(info):
             return True
-        now = time.monotonic()
-        self.stage_s.append(now - self.since)
-        # without an encoder's guess the first answer at once; a later one when the time it takes is a tenth of what
-        # went by; none that is underway once a run is whole
-        if self.on_answer is not None and self.answer is None and now - self.answered >= 9.0 * self.answering:
-            self._answer(info.samples())
-        self.since = time.monotonic()
+        due = self._early_at + 9.0 * self._early_s
+        if self.callbacks.on_answer is not None and not self._whole and time.monotonic() >= due:
+            self._hand_out_early(info.samples())
         return None
 
-    def _answer(self, posterior: Posterior) -> None:
-        """Hand out what there is so far, from fewer shapes."""
-        assert self.on_answer is not None
+    def log_line(self, found: Findings, failed: int, wanted: int) -> str:
+        """What the runs so far found, in words, and whether more are wanted."""
+        line = f"{self._particles(found.runs)}: "
+        known = np.isfinite(found.expected_loss)
+        line += f"expected loss {found.expected_loss:.4f} nats" if known else "expected loss not known"
+        line += f", {100 * found.unexplained:.0f}% of pixels not explained"
+        if failed:
+            line += f", populations that failed and are left out: {failed}"
+        return line + (f" -> {self._particles(wanted)}" if wanted > found.runs else "")
+
+    def _particles(self, runs: int) -> str:
+        return f"{runs * self.sampler.smc.populations} x {self.sampler.smc.particles} particles"
+
+    def _hand_out_early(self, posterior: Posterior) -> None:
+        """An answer of fewer shapes."""
         begun = time.monotonic()
-        self.on_answer(self.publish(posterior, self.config.first_hypotheses))
-        self.answered = time.monotonic()
-        self.answering = self.answered - begun
+        self.hand_out(self._published(posterior, self.config.first_hypotheses))
+        self._early_at = time.monotonic()
+        self._early_s = self._early_at - begun
 
-    def publish(self, posterior: Posterior, count: int) -> Hypotheses:
-        """The samples at hand as planners read them."""
-        before = self.part
-        self.turn_to("publishing")
-        more = {"point_gradients": self.point_gradients, "evidence_power": self.smc.evidence_power}
-        config = replace(self.config, hypotheses=count)
-        h = published(self.view, posterior, self.likelihood, self.prior, config, self.seed, more)
-        self.turn_to(before)
-        return replace(h, stage=max(self.stages, h.stage))
-
-    def short_of(self) -> str | None:
-        """Which limit leaves no room for a next run, if one does: it takes the time of the run before, at least."""
-        if self.cap is not None and self.stages >= self.cap:
-            return "stages"
-        expected = len(self.stage_s) * min(self.stage_s)
-        if self.deadline is not None and time.monotonic() + expected > self.deadline:
-            return "budget"
-        return None
-
-    def amount(self, runs: int) -> str:
-        """The particles of so many runs, in words."""
-        return f"{runs * self.smc.populations} x {self.smc.particles} particles"
+    def _published(self, posterior: Posterior, count: int) -> Hypotheses:
+        sampler, config = self.sampler, replace(self.config, hypotheses=count)
+        with sampler.stopwatch.part("publishing"):
+            h = published(
+                sampler.view, posterior, sampler.likelihood, sampler.prior, config, sampler.seed,
+                point_gradients=sampler.point_gradients, evidence_power=sampler.smc.evidence_power,
+            )  # fmt: skip
+        return replace(h, stage=max(sampler.stages, h.stage))

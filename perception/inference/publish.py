@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
+from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
 from perception.inference.settings import PublishConfig
 from perception.observation.object_frame import ObjectFrame
@@ -23,13 +24,14 @@ from probnerf.types import Observation, Posterior
 
 @dataclass(frozen=True, eq=False)
 class ConditionedView:
-    """What is conditioned on, and the frame that the answer is given in: the newest one."""
+    """What inference is conditioned on, and the frame that the answer is given in: the newest one."""
 
     frame: Frame
     segment: Segment
     observation: Observation  # of this frame, or of several joined
     object_frame: ObjectFrame  # in this frame's camera
     seen: Bool[np.ndarray, "g g g"]  # by any frame
+    pose_known: bool = False  # `object_frame` is the object's own cube (the handle at +x): only the shape is inferred
 
 
 def published(
@@ -39,9 +41,10 @@ def published(
     prior: Prior,
     config: PublishConfig,
     seed: int,
-    diagnostics: dict[str, float],
+    point_gradients: float,
+    evidence_power: float,
 ) -> Hypotheses:
-    """A posterior as planners read it; `diagnostics` are added to the sampler's own."""
+    """A posterior as planners read it. The last two are told on (`AnswerDiagnostics`)."""
     chosen, weights, population = thin(posterior, config.hypotheses)
     sizeless = without_sizes(likelihood)
     # NumPy: how many there are to choose from varies, and nothing may compile for it
@@ -75,20 +78,21 @@ def published(
         monte_carlo_error=0.0,
         prior_hash=prior.hash,
         seed=seed,
-        diagnostics={
-            "acceptance": float(d.acceptance),
-            "divergences": float(d.divergences),
-            "r_hat": float(d.r_hat),
-            "ess": float(d.ess),
-            "ancestors": float(d.ancestors),
-            "beta": float(np.min(np.asarray(d.beta))),
-            "log_evidence": float(posterior.log_evidence),
-            "log_evidence_se": float(posterior.log_evidence_se),
-            "explained": fit,
-            "failed_populations": float(len(np.unique(posterior.population)) - len(np.unique(population))),
-            "power": likelihood.power,
-            **diagnostics,
-        },
+        diagnostics=AnswerDiagnostics(
+            acceptance=float(d.acceptance),
+            divergences=float(d.divergences),
+            r_hat=float(d.r_hat),
+            ess=float(d.ess),
+            ancestors=float(d.ancestors),
+            beta=float(np.min(np.asarray(d.beta))),
+            log_evidence=float(posterior.log_evidence),
+            log_evidence_se=float(posterior.log_evidence_se),
+            explained=fit,
+            failed_populations=float(len(np.unique(posterior.population)) - len(np.unique(population))),
+            power=likelihood.power,
+            point_gradients=point_gradients,
+            evidence_power=evidence_power,
+        ),
         result=posterior.result,
     )
     return _with_error(draft)
@@ -102,7 +106,7 @@ def _with_error(h: Hypotheses) -> Hypotheses:
     return replace(
         h,
         monte_carlo_error=float(h.estimate(count / max(hidden.sum(), 1))[1]),
-        diagnostics={**h.diagnostics, "expected_loss": expected_loss(h, hidden)},
+        diagnostics=replace(h.diagnostics, expected_loss=expected_loss(h, hidden)),
     )
 
 

@@ -10,6 +10,7 @@ from perception.observation.segmentation import Segment
 from perception.sources.frame import Frame
 from probnerf.prior.checkpoint import Prior
 from probnerf.sampling.hmc import StageInfo
+from probnerf.types import StopReason
 
 
 def estimate_each(
@@ -43,5 +44,5 @@ def estimate_each(
             yield segment, error
             continue
         yield segment, result
-        if result.hypotheses.result == "interrupted":
+        if result.hypotheses.result == StopReason.INTERRUPTED:
             return

@@ -1,7 +1,6 @@
 """Settings of inference on frames, publishing and tracking. Standard library only, for the command line reads them
 without JAX."""
 
-import math
 from dataclasses import dataclass, field
 
 from perception.observation.settings import ObserveConfig
@@ -40,15 +39,6 @@ class ControllerConfig(PublishConfig):
             raise ValueError(f"first_hypotheses {self.first_hypotheses} and runs {self.runs} must be 1 or more")
         if not (self.tolerance >= 0.0 and 0.0 <= self.unexplained <= 1.0):
             raise ValueError(f"tolerance {self.tolerance:g} must be 0 or more, unexplained {self.unexplained:g} 0 to 1")
-
-    def needed(self, done: int, loss: float, missed: float) -> int:
-        """How many runs the answer takes, if `done` of them leave this expected loss and share of pixels missed."""
-        if missed > self.unexplained:
-            return self.runs
-        if loss <= self.tolerance or math.isinf(self.tolerance):  # whatever it loses, known or not
-            return done
-        wanted = done * loss / self.tolerance if self.tolerance > 0 and math.isfinite(loss) else math.inf
-        return min(self.runs, max(done + 1, math.ceil(min(wanted, self.runs))))
 
 
 @dataclass(frozen=True)

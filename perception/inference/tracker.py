@@ -10,13 +10,14 @@ that the hypotheses do not explain shows an object that moved.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from enum import StrEnum
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from perception.answers.hypotheses import Hypotheses
 from perception.inference.controller import infer_view
+from perception.inference.limits import NO_CALLBACKS, NO_LIMITS, Callbacks, Limits
 from perception.inference.publish import ConditionedView
 from perception.inference.settings import ControllerConfig, TrackConfig
 from perception.observation.object_frame import ObjectFrame, object_frame
@@ -27,19 +28,26 @@ from perception.sources.frame import Frame
 from probnerf.inference import likelihood_of, without_sizes
 from probnerf.prior.checkpoint import Prior
 from probnerf.rendering.occupancy import above_plane
-from probnerf.sampling.hmc import StageInfo
 from probnerf.sampling.populations import thin
 from probnerf.shapes import explained
-from probnerf.types import Observation, Posterior, joined, on_device
+from probnerf.types import Observation, Posterior, StopReason, joined, on_device
 
-Change = Literal["new", "view", "continued", "same", "moved"]
+
+class Change(StrEnum):
+    """What one frame does to what is known of one object."""
+
+    NEW = "new"  # it is seen for the first time
+    VIEW = "view"  # it is seen from another side: a further view to condition on
+    CONTINUED = "continued"  # nothing to add; sampling that was cut short goes on
+    SAME = "same"  # nothing to add, and nothing left to sample
+    MOVED = "moved"  # it does not stand where it stood: begun anew
 
 
 @dataclass(frozen=True, eq=False)
 class Update:
     """What one frame did to what is known of one object."""
 
-    change: Change  # first seen; a view added; sampling gone on; nothing to add; moved, so started again
+    change: Change
     hypotheses: Hypotheses
     stages: int  # of the sampler, spent on this frame
     agreement: float  # share explained of the frame's telling pixels by the hypothesis that explains most (NaN: new)
@@ -76,14 +84,19 @@ class Look:
     agreement: float
     hypotheses: Hypotheses | None  # what is known of it already, under this frame's stamp; None: nothing that holds
     seed: int
-    _view: ConditionedView  # to condition on
+    _view: ConditionedView
     _kept: tuple[_Kept, ...]
     _track: _Track | None  # that is gone on from
 
     @property
+    def builds_on(self) -> bool:
+        """What is to be inferred goes on from what was known of the object."""
+        return self.change in (Change.VIEW, Change.CONTINUED)
+
+    @property
     def settled(self) -> bool:
         """There is nothing to infer."""
-        return self.change == "same"
+        return self.change == Change.SAME
 
 
 @dataclass
@@ -97,11 +110,18 @@ class Tracker:
     _tracks: dict[int, _Track] = field(default_factory=dict)
     _names: set[int] = field(default_factory=set)  # that were given
 
-    def update(self, frame: Frame, segment: Segment, **limits: Any) -> Update:
+    def update(
+        self,
+        frame: Frame,
+        segment: Segment,
+        *,
+        stages: int | None = None,
+        on_answer: Callable[[Hypotheses], None] | None = None,
+    ) -> Update:
         """Take a frame's segment into account: `look`, and `infer` where there is something to infer."""
         look = self.look(frame, segment)
         assert look is not None
-        return self.infer(look, **limits)
+        return self.infer(look, Limits(stages=stages), Callbacks(on_answer=on_answer))
 
     def look(
         self, frame: Frame, segment: Segment, how: Callable[[int], tuple[int, bool] | None] | None = None
@@ -120,38 +140,32 @@ class Tracker:
             return None
         seed, fresh = chosen
         segment = replace(segment, id=name)
-        change: Change = "new"
+        change = Change.NEW
         agreement = float("nan")
         if track is not None and not fresh:
             cube = track.anchor.seen_from(_moved_by(track.first, frame))
             observation, _ = observe(frame, segment, self.config.observe, seed, cube)
             agreement = self._agreement(track.posterior, observation)
             still = frame.T_world_camera is not None or _same_plane(cube.plane, found.plane, self.track)
+            view = ConditionedView(frame, segment, observation, cube, track.seen)
             if still and agreement >= self.track.moved_below:
-                return self._go_on(
-                    name, track, ConditionedView(frame, segment, observation, cube, track.seen), agreement, seed
-                )
-            change = "moved"
+                return self._go_on(name, track, view, agreement, seed)
+            change = Change.MOVED
         observation, _ = observe(frame, segment, self.config.observe, seed, found)
-        view = ConditionedView(frame, segment, observation, found, seen_voxels(frame, segment, found, self.config.grid))
+        seen = seen_voxels(frame, segment, found, self.config.grid)
+        view = ConditionedView(frame, segment, observation, found, seen)
         return Look(name, change, agreement, None, seed, view, (_Kept(observation, _direction(found)),), None)
 
-    def infer(
-        self,
-        look: Look,
-        *,
-        deadline: float | None = None,
-        stages: int | None = None,
-        on_stage: Callable[[StageInfo], bool | None] | None = None,
-        on_answer: Callable[[Hypotheses], None] | None = None,
-    ) -> Update:
-        """Sample what a look left to be inferred, and keep it. The limits are `infer_view`'s."""
+    def infer(self, look: Look, limits: Limits = NO_LIMITS, callbacks: Callbacks = NO_CALLBACKS) -> Update:
+        """Sample what a look left to be inferred, and keep it. Where something is known of the object already, the
+        encoder's guess is not handed out.
+        """
         track = look._track
         if look.settled and track is not None and look.hypotheses is not None:
             self._tracks[look.object_id] = replace(track, hypotheses=look.hypotheses)
             return Update(look.change, look.hypotheses, 0, look.agreement, 0.0)
         before = None
-        if look.change == "continued" and track is not None:
+        if look.change == Change.CONTINUED and track is not None:
             estimates = np.asarray(track.posterior.diagnostics.log_evidences)
             before = track.posterior if np.isfinite(estimates).all() else None
         result = infer_view(
@@ -160,11 +174,8 @@ class Tracker:
             self.config,
             seed=look.seed,
             before=before,
-            fresh=look.hypotheses is None,
-            deadline=deadline,
-            stages=stages,
-            on_stage=on_stage,
-            on_answer=on_answer,
+            limits=limits,
+            callbacks=replace(callbacks, guess=callbacks.guess and look.hypotheses is None),
         )
         self._tracks[look.object_id] = _Track(
             anchor=look._view.object_frame if track is None else track.anchor,
@@ -202,10 +213,11 @@ class Tracker:
         hidden = above_plane(self.config.grid) & ~track.seen
         adds = float((hidden & seen).sum()) / max(int(hidden.sum()), 1) >= self.track.adds
         kept = track.kept
-        change: Change = "same" if track.posterior.result == "converged" else "continued"
+        whole = track.posterior.result == StopReason.CONVERGED
+        change = Change.SAME if whole else Change.CONTINUED
         if adds:
             kept = _with_view(kept, _Kept(view.observation, _direction(view.object_frame)), self.track)
-            change = "view"
+            change = Change.VIEW
         h = replace(
             track.hypotheses,
             stamp_ns=view.frame.stamp_ns,

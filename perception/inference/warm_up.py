@@ -6,6 +6,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 
+from perception.inference.limits import Callbacks, Limits
 from perception.inference.tracker import Look, Tracker
 from perception.observation.segmentation import Segment, segment
 from perception.sources.frame import Frame
@@ -13,7 +14,7 @@ from perception.sources.recording import Log
 from perception.sources.settings import SHIPPED_LOG
 from probnerf.compile_cache import rehearsal
 from probnerf.inference import infer
-from probnerf.types import FREE, UNKNOWN, Posterior
+from probnerf.types import FREE, UNKNOWN, Posterior, StopReason
 
 
 def warm_up(tracker: Tracker) -> None:
@@ -42,8 +43,8 @@ def warm_up(tracker: Tracker) -> None:
 
 def _infer_twice(trial: Tracker, look: Look, frame: Frame, hidden: Segment) -> None:
     """The object alone, again where that was cut short, and half hidden."""
-    update = trial.infer(look, stages=1, on_answer=lambda _: None)
-    if update.hypotheses.result == "interrupted":
+    update = trial.infer(look, Limits(stages=1), Callbacks(on_answer=lambda _: None))
+    if update.hypotheses.result == StopReason.INTERRUPTED:
         raise KeyboardInterrupt
     again = trial.look(frame, _alone(hidden))
     assert again is not None
@@ -58,7 +59,7 @@ def _sampled(trial: Tracker, look: Look, before: Posterior | None) -> Posterior:
     observation = look._view.observation
     key, config = jax.random.key(0), trial.config.infer
     posterior, _ = infer(key, trial.prior.model, observation, config, before=before, stages=1)
-    if posterior.result == "interrupted":
+    if posterior.result == StopReason.INTERRUPTED:
         raise KeyboardInterrupt
     return posterior
 

@@ -12,7 +12,7 @@ from jaxtyping import PRNGKeyArray
 
 from probnerf.sampling.hmc import HMCState, LogLikelihood, StageInfo, Target, hmc_step, split_r_hat
 from probnerf.settings import AnnealedHMCConfig
-from probnerf.types import Diagnostics, Posterior
+from probnerf.types import Diagnostics, Posterior, StopReason
 
 MAX_ANNEALED_STEP = 1.0  # radians: a turn of the prior beyond it is never useful
 
@@ -51,10 +51,10 @@ def annealed_hmc(
     state = _annealed_start(start_key, args, log_likelihood=log_likelihood, chains=config.chains, dim=dim)
     kept = [(np.asarray(state.position), np.asarray(state.log_likelihood))]
     acceptances: list[float] = []
-    divergences, base, beta, result = 0, config.step_per_scale, 0.0, "stages"
+    divergences, base, beta, result = 0, config.step_per_scale, 0.0, StopReason.STAGES
     base = min(base, MAX_ANNEALED_STEP / config.s_start)
 
-    def samples(result: str = "underway") -> Posterior:
+    def samples(result: StopReason = StopReason.UNDERWAY) -> Posterior:
         return _annealed_posterior(config, kept, acceptances, divergences, beta, result)
 
     try:
@@ -62,7 +62,7 @@ def annealed_hmc(
             # An iteration costs about the mean of those before: none is begun that would overrun the deadline.
             now = time.monotonic()
             if deadline is not None and now + (now - begun) / t > deadline:
-                result = "budget"
+                result = StopReason.BUDGET
                 break
             scale = config.s_start * (config.s_end / config.s_start) ** (t / config.iterations)
             beta, step = (config.s_end / scale) ** 2, base * scale
@@ -80,10 +80,10 @@ def annealed_hmc(
                 none, seconds = (float("nan"),), time.monotonic() - begun
                 told = StageInfo(t, (beta,), none, (acceptances[-1],), (step,), none, divergences, seconds, samples)
                 if on_stage(told):
-                    result = "stopped"
+                    result = StopReason.STOPPED
                     break
     except KeyboardInterrupt:
-        result = "interrupted"
+        result = StopReason.INTERRUPTED
     return samples(result)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from probnerf.sampling.hmc import HMCState, split_r_hat
-from probnerf.types import Diagnostics, Posterior
+from probnerf.types import Diagnostics, Posterior, StopReason
 
 # Nats under the best population's evidence from which on one has failed: it never left a poor mode. Those that found
 # different good ones differ by a few nats, which are mostly noise. On validation views no answer got worse by it; under
@@ -43,7 +43,7 @@ def gathered(
     variance: Float[np.ndarray, "m"],
     evidence_power: float,
     told: dict[str, Array],
-    result: str,
+    result: StopReason,
 ) -> Posterior:
     """The pools [m, n, ...] of a run's last stages as one posterior; `told` is what else its diagnostics say.
 

@@ -38,7 +38,7 @@ from probnerf.sampling.hmc import (
 from probnerf.sampling.populations import gathered, log_prior
 from probnerf.sampling.resampling import choose, next_beta
 from probnerf.settings import TemperedSMCConfig
-from probnerf.types import Posterior
+from probnerf.types import Posterior, StopReason
 
 
 class _State(eqx.Module):
@@ -218,9 +218,9 @@ def tempered_smc(
     gradients = float(config.populations * config.particles)
     kept: list[HMCState] = []  # the pools of the final stages
     cap = config.max_stages if stages is None else min(stages, config.max_stages)
-    done, divergences, shortest, acceptance, result = 0, 0, float("inf"), float("nan"), "converged"
+    done, divergences, shortest, acceptance, result = 0, 0, float("inf"), float("nan"), StopReason.CONVERGED
 
-    def samples(result: str = "underway") -> Posterior:
+    def samples(result: StopReason = StopReason.UNDERWAY) -> Posterior:
         chains = kept or [state.chain]
         told = {
             "acceptance": jax.device_put(np.float32(acceptance)),
@@ -239,14 +239,14 @@ def tempered_smc(
             if on_stage is not None:
                 told = _progress(done, state, info, divergences, time.monotonic() - begun, samples)
                 if on_stage(told) and not ended:
-                    result = "stopped"
+                    result = StopReason.STOPPED
                     break
             if ended:
                 break
             now = time.monotonic()
             expected = shortest if done > 1 else 0.0
             if done >= cap or (deadline is not None and now + expected > deadline):
-                result = "stages" if done >= cap else "budget"
+                result = StopReason.STAGES if done >= cap else StopReason.BUDGET
                 break
             final = bool(np.all(np.asarray(state.beta) == 1.0))
             state, info, pool = _stage(
@@ -260,7 +260,7 @@ def tempered_smc(
             shortest = shortest if done == 1 else min(shortest, seconds)
             gradients += config.populations * config.particles * config.moves * config.leapfrog_steps
     except KeyboardInterrupt:
-        result = "interrupted"
+        result = StopReason.INTERRUPTED
     return samples(result)
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.camera import Camera
+from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
 from perception.observation.rays import observe
 from perception.observation.segmentation import Segment
@@ -17,7 +18,7 @@ from perception.simulation.simulated_camera import PlacedObject, TableScene, pla
 from perception.sources.frame import Frame
 from probnerf.objects.tabletop import signed_distance
 from probnerf.rendering.occupancy import voxel_centres
-from probnerf.types import Pose
+from probnerf.types import Pose, StopReason
 
 MUG = PlacedObject(2_900_727, 0.0, -0.06, np.pi)
 CARTON = PlacedObject(2_900_483, 0.0, 0.09, 0.3)
@@ -69,8 +70,8 @@ def mug_hypotheses(
         "monte_carlo_error": 0.01,
         "prior_hash": "",
         "seed": 0,
-        "diagnostics": {"acceptance": 0.75, "ess": 12.0, "log_evidence": -321.5, "log_evidence_se": 0.5},
-        "result": "converged",
+        "diagnostics": AnswerDiagnostics(acceptance=0.75, ess=12.0, log_evidence=-321.5, log_evidence_se=0.5),
+        "result": StopReason.CONVERGED,
     }
     return Hypotheses(**{**fields, **changes})
 

@@ -4,9 +4,11 @@ import socket
 
 import numpy as np
 
+from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
 from perception.observation.object_frame import ObjectFrame
 from probnerf.rendering.occupancy import voxel_centres
+from probnerf.types import StopReason
 
 GRID, HALF_EXTENT = 32, 0.16
 BODY = ((-0.04, -0.04, -0.08), (0.04, 0.04, 0.08))  # metres, object frame
@@ -41,8 +43,8 @@ def body_with_handle(weights: tuple[float, float] = (0.3, 0.7), object_id: int =
         "monte_carlo_error": 0.0125,
         "prior_hash": "ab12",
         "seed": 7,
-        "diagnostics": {"ess": 12.5, "explained": 0.93},
-        "result": "converged",
+        "diagnostics": AnswerDiagnostics(ess=12.5, explained=0.93),
+        "result": StopReason.CONVERGED,
     }
     return Hypotheses(**{**fields, **changes})
 

@@ -18,6 +18,7 @@ from perception.sources.frame import Frame
 from perception.sources.recorder import write_log
 from probnerf.prior.checkpoint import Prior, save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
+from probnerf.types import StopReason
 from tests.node.mugs import MUG, mug_hypotheses, table_frame, write_folder
 
 BOX = ["--box", "-0.02", "-0.02", "0", "0.02", "0.02", "0.05"]
@@ -46,7 +47,7 @@ class Asked:
 
     def __init__(self) -> None:
         self.calls: list[dict] = []
-        self.result = "converged"
+        self.result = StopReason.CONVERGED
 
     def __call__(self, frame: Frame, found: Segment, prior: Prior, config: object, **asked) -> Estimate:
         self.calls.append({"id": found.id, "prior": prior, "config": config, **asked})
@@ -130,7 +131,7 @@ def test_one_object_that_fails_does_not_stop_the_others(
 
 
 def test_ctrl_c_keeps_what_is_there(folder: Path, tmp_path: Path, prior: Path, asked: Asked) -> None:
-    asked.result = "interrupted"
+    asked.result = StopReason.INTERRUPTED
     out = tmp_path / "out"
     assert main(["replay", str(folder), "--prior", str(prior), "--out", str(out)]) == 130
     assert sorted(p.name for p in out.iterdir()) == ["frame", "object_1.npz", "object_1.png"]

@@ -7,6 +7,7 @@ raises where it has none.
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from enum import Enum
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
+from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
 from perception.observation.object_frame import ObjectFrame
 from perception.sources.frame import Frame
@@ -53,6 +55,8 @@ def by_type(hint: Any) -> st.SearchStrategy:
         return st.one_of(*map(by_type, inner))
     if origin is dict:
         return st.dictionaries(by_type(inner[0]), by_type(inner[1]), max_size=4)
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return st.sampled_from(hint)
     if isinstance(hint, type) and is_dataclass(hint):
         return every_field(hint)
     raise TypeError(f"say how a {hint} is drawn")
@@ -127,7 +131,7 @@ def hypotheses(**own: Any) -> st.SearchStrategy[Hypotheses]:
         "stamp_ns": stamps,
         "object_frame": object_frames(),
         "T_world_camera": st.none() | poses(),
-        "diagnostics": st.dictionaries(texts, st.floats(), max_size=4),
+        "diagnostics": st.builds(AnswerDiagnostics, **{f.name: st.floats() for f in fields(AnswerDiagnostics)}),
     }
     return every_field(Hypotheses, _shapes(), **(usual | own))
 

@@ -19,7 +19,8 @@ from node.commands.config_file import load_config
 from node.commands.live import _Keeper
 from node.commands.options import LiveConfig
 from node.viewer.page import Page
-from perception.inference.tracker import Tracker, Update
+from perception.inference.limits import Callbacks, Limits
+from perception.inference.tracker import Change, Tracker, Update
 from perception.sources.frame import StillSource
 from perception.sources.reader import Reader
 from perception.sources.recorder import Recorder
@@ -27,6 +28,7 @@ from perception.sources.recording import Log
 from perception.sources.settings import SHIPPED_LOG
 from probnerf.prior.checkpoint import save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
+from probnerf.types import StopReason
 from tests.conftest import ROOT
 from tests.node.shapes import body_with_handle
 
@@ -46,9 +48,10 @@ def test_ctrl_c_in_the_sampler_ends_the_node(
 ) -> None:
     deadlines = []
 
-    def infer(self: Tracker, look: Any, *, deadline: float, **_: Any) -> Update:
-        deadlines.append(deadline)
-        return Update("new", replace(body_with_handle(), result="interrupted"), 1, 0.0, 0.0)  # as the sampler tells it
+    def infer(self: Tracker, look: Any, limits: Limits, _: Any) -> Update:
+        deadlines.append(limits.deadline)
+        interrupted = replace(body_with_handle(), result=StopReason.INTERRUPTED)  # as the sampler says it
+        return Update(Change.NEW, interrupted, 1, 0.0, 0.0)
 
     monkeypatch.setattr(Tracker, "infer", infer)
     assert main([*run, "--seconds", "30"]) == 0
@@ -74,11 +77,11 @@ def test_a_page_that_fails_ends_no_inference(
     def fail(self: Page, scene: Any, view: Any) -> None:
         raise RuntimeError("nothing to draw with")
 
-    def infer(self: Tracker, look: Any, *, on_answer: Any, **limits: Any) -> Update:
+    def infer(self: Tracker, look: Any, limits: Limits, callbacks: Callbacks) -> Update:
         h = replace(body_with_handle(), object_id=look.object_id)
-        for again in (h, h, h):
-            on_answer(again)
-        return Update("new", h, 1, 0.0, 0.0)
+        for _ in range(3):
+            callbacks.on_answer(h)
+        return Update(Change.NEW, h, 1, 0.0, 0.0)
 
     monkeypatch.setattr(Page, "show", fail)
     monkeypatch.setattr(Tracker, "infer", infer)
@@ -125,6 +128,7 @@ def test_a_recording_that_broke_off_is_an_error_at_the_end(
 PROGRAM = """
 import sys
 from node.__main__ import COMMANDS, main
+from probnerf.types import StopReason
 
 def interrupted(_):
     import jax, os, threading, time

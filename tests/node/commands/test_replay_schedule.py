@@ -21,6 +21,7 @@ from node.commands.replay import ReplayConfig
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.hypotheses_file import load
 from perception.inference.controller import Estimate, estimate
+from perception.inference.limits import Limits
 from perception.inference.publish import ConditionedView
 from perception.inference.schedule import config_hash, scheduled
 from perception.inference.settings import ControllerConfig
@@ -87,8 +88,10 @@ def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def pretending(monkeypatch: pytest.MonkeyPatch) -> None:
-    def pretend_view(view: ConditionedView, prior: Prior, config: ControllerConfig, **asked: Any) -> Estimate:
-        return pretend(view.frame, view.segment, prior, config, **asked)
+    def pretend_view(
+        view: ConditionedView, prior: Prior, config: ControllerConfig, seed: int, limits: Limits, **_: Any
+    ) -> Estimate:
+        return pretend(view.frame, view.segment, prior, config, seed=seed, stages=limits.stages)
 
     monkeypatch.setattr(perception.inference.tracker, "infer_view", pretend_view)
 

@@ -17,6 +17,7 @@ from perception.answers.hypotheses_file import load, save
 from perception.answers.query import query
 from perception.answers.regions import Box
 from perception.inference.controller import Estimate
+from perception.inference.limits import Limits
 from perception.inference.publish import ConditionedView
 from perception.inference.schedule import config_hash, digest, scheduled
 from perception.inference.settings import ControllerConfig
@@ -95,7 +96,7 @@ def test_a_schedule_repeats_the_object_that_it_names(
             frame = replace(picture(*things, label=False), stamp_ns=stamp)
             recorder.write_frame(frame)
             for look in [tracker.look(frame, s, lambda _: (7, True)) for s in segment(frame, None, config.segment)]:
-                live.append(tracker.infer(look, stages=2).hypotheses)
+                live.append(tracker.infer(look, Limits(stages=2)).hypotheses)
                 recorder.write_schedule(
                     scheduled(live[-1], config_hash(config.inference, config.segment, config.track))
                 )

@@ -10,12 +10,14 @@ import pytest
 from node.figures import voxel_renderer
 from node.figures.object_figure import draw_object, draw_training, representatives
 from node.figures.summary import answer, diagnostics, figures, hidden_volume, warnings
+from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.summary import Direction, Summary
 from perception.observation.object_frame import ObjectFrame
 from perception.observation.segmentation import segment
 from perception.sources.frame import Frame
 from probnerf.rendering.occupancy import voxel_centres
+from probnerf.types import StopReason
 from tests.node.mugs import mug_hypotheses, table_frame
 
 GRID = 32
@@ -121,22 +123,22 @@ def test_the_short_table_tells_the_unseen(mug: Hypotheses) -> None:
     rows = {**figures(mug), **diagnostics(mug)}
     assert rows["log evidence"] == "-321.5 ± 0.5 nats" and rows["stopped"] == "converged, stage 7"
     assert rows["hypotheses"].startswith("4 (2.7") and "cm³" in rows["solid in it"]
-    assert diagnostics(replace(mug, diagnostics={"log_evidence": float("nan")}))["log evidence"] == "none"
+    assert diagnostics(replace(mug, diagnostics=AnswerDiagnostics()))["log evidence"] == "none"
 
 
 def test_warnings_are_about_what_the_user_can_change(mug: Hypotheses) -> None:
     assert not warnings(mug)
-    assert not warnings(replace(mug, diagnostics={"divergences": 2.0, "r_hat": 1.3}))  # numbers, not doubts
+    assert not warnings(replace(mug, diagnostics=AnswerDiagnostics(divergences=2.0, r_hat=1.3)))  # numbers, not doubts
     assert len(warnings(replace(mug, out_of_model=True, inside_view=False))) == 2
-    lost = {"failed_populations": 3.0}
+    lost = AnswerDiagnostics(failed_populations=3.0)
     (line,) = warnings(replace(mug, population=np.zeros_like(mug.population), diagnostics=lost))
     assert line.startswith("the answer rests on one of 4 populations") and "take another view" in line
     assert not warnings(replace(mug, population=np.arange(len(mug.weights)) % 2, diagnostics=lost))
-    (line,) = warnings(replace(mug, result="budget"))
+    (line,) = warnings(replace(mug, result=StopReason.BUDGET))
     assert line.startswith("the time was up") and "raise the budget" in line
     (line,) = warnings(replace(mug, out_of_model=True))
     assert line.startswith("out of model: no shape of the prior")
-    (line,) = warnings(replace(mug, out_of_model=True, result="budget"))  # time may be all that it lacked
+    (line,) = warnings(replace(mug, out_of_model=True, result=StopReason.BUDGET))  # time may be all that it lacked
     assert "cut short (budget); give it more time" in line and "out of model" not in line
 
 

@@ -12,7 +12,7 @@ from perception.answers.query import query
 from perception.answers.regions import Box, Points
 from perception.observation.segmentation import segment
 from perception.sources.frame import Frame
-from probnerf.types import BASE_Z, OBJECT
+from probnerf.types import BASE_Z, OBJECT, StopReason
 from tests.node.mugs import mug_hypotheses, table_frame
 
 
@@ -176,7 +176,7 @@ def test_words_are_plain(mug: Hypotheses) -> None:
     now = mug.stamp_ns + 90 * 10**9
     said = panel.state([mug], now)
     assert "no doubts" in said and "stage 7" in said and "the sampler finished" in said and "0.010" in said
-    odd = replace(mug, out_of_model=True, label="<b>", result="budget", inside_view=False)
+    odd = replace(mug, out_of_model=True, label="<b>", result=StopReason.BUDGET, inside_view=False)
     said = panel.state([odd], now)
     assert "OUT OF MODEL" in said and "cuts the object off" in said and "time was up" in said
     assert "<b></b>" not in said and "&lt;b&gt;" in said

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses, binary_entropy, by_weight, meshes, surface_points
 from perception.answers.hypotheses_file import hypotheses_path, load, load_scene, save
 from perception.observation.object_frame import ObjectFrame
 from probnerf.rendering.occupancy import voxel_centres
-from probnerf.types import BASE_Z
+from probnerf.types import BASE_Z, StopReason
 
 GRID = 16
 HALF_EXTENT = 0.08
@@ -56,8 +57,8 @@ def _hypotheses(opacity: np.ndarray, weights: list[float], **changes) -> Hypothe
         monte_carlo_error=0.0125,
         prior_hash="5f3a",
         seed=17,
-        diagnostics={"ess": 12.5, "r_hat": float("nan")},
-        result="stages",
+        diagnostics=AnswerDiagnostics(ess=12.5),
+        result=StopReason.STAGES,
     )
     return replace(h, **changes)
 
@@ -76,10 +77,8 @@ def mixed() -> Hypotheses:
 
 
 def _same(a: Any, b: Any) -> bool:
-    if isinstance(a, ObjectFrame | Hypotheses):
+    if isinstance(a, ObjectFrame | Hypotheses | AnswerDiagnostics):
         return all(_same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(_same(a[k], b[k]) for k in a)
     if a is None or b is None:
         return a is b
     return np.asarray(a).dtype == np.asarray(b).dtype and np.array_equal(
@@ -186,6 +185,8 @@ def test_newer_and_inconsistent_files_are_refused(tmp_path, mixed):
         ({"weights": np.array([0.5, 0.5])}, r"weights has shape \[2\]"),
         ({"opacity": mixed.opacity.astype(np.float32)}, "opacity is float32"),
         ({"seen": mixed.seen.astype(np.uint8)}, "seen is uint8"),
+        ({"result": "bored"}, "why sampling stopped is 'bored'; it must be one of converged, budget"),
+        ({"diagnostics": {"ess": "many"}}, "the diagnostic ess is 'many'; it must be a number"),
     ]
     for changes, message in cases:
         path = tmp_path / "object_3.npz"
@@ -201,6 +202,15 @@ def test_a_file_of_the_first_format_is_read_as_standing_on_the_plane(tmp_path, m
     _rewrite(path, format="farside-hypotheses-1", pose=mixed.pose[:, :4])
     np.testing.assert_array_equal(load(path).base, BASE_Z)
     np.testing.assert_array_equal(load(path).solid, mixed.solid)
+
+
+def test_diagnostics_of_another_version_are_read_as_far_as_they_are_known(tmp_path, mixed):
+    path = tmp_path / "object_3.npz"
+    save(path, mixed)
+    _rewrite(path, diagnostics={"ess": 7, "of a later version": 1.0})
+    diagnostics = load(path).diagnostics
+    assert diagnostics.ess == 7.0 and np.isnan(diagnostics.r_hat)  # the one that is missing was not measured
+    assert load(path).failed == 0
 
 
 class _Trap:

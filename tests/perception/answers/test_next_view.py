@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.next_view import _words as words_of
 from perception.answers.next_view import first_hits, rank_views, ring_of_views
 from perception.observation.object_frame import ObjectFrame
 from probnerf.geometry import look_at
 from probnerf.rendering.occupancy import voxel_centres
+from probnerf.types import StopReason
 
 GRID, HALF_EXTENT, DISTANCE = 32, 0.16, 0.6
 PRESENT = look_at(np.array([DISTANCE, 0.0, 0.0]), np.zeros(3))  # the camera looks from +x
@@ -39,8 +41,8 @@ def object_of(*shapes: np.ndarray, weights: list[float], object_id: int = 1) -> 
         monte_carlo_error=0.0,
         prior_hash="",
         seed=0,
-        diagnostics={},
-        result="stages",
+        diagnostics=AnswerDiagnostics(),
+        result=StopReason.STAGES,
     )
 
 

@@ -5,11 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.query import CAUTION, query
 from perception.answers.regions import Box, Points, Swept
 from perception.observation.object_frame import ObjectFrame
 from probnerf.rendering.occupancy import voxel_centres
+from probnerf.types import StopReason
 
 GRID, HALF_EXTENT = 32, 0.16
 VOXEL = 2 * HALF_EXTENT / GRID  # 1 cm
@@ -52,8 +54,8 @@ def _object(shapes: list[np.ndarray], weights: list[float], origin=(0.0, 0.0, 0.
         monte_carlo_error=0.0,
         prior_hash="",
         seed=0,
-        diagnostics={},
-        result="stages",
+        diagnostics=AnswerDiagnostics(),
+        result=StopReason.STAGES,
     )
 
 

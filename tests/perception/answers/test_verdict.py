@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.query import QueryResult, query
 from perception.answers.regions import Box
 from tests.perception.answers.test_query import BODY, _fill, _object
@@ -52,7 +53,7 @@ def test_hypotheses_that_all_agree_leave_a_doubt_for_each_object() -> None:
 def test_one_population_that_did_not_fail_is_one_witness() -> None:
     shapes = [_fill(BODY, ((0.08 + 0.002 * k, 0.08, -0.08), (0.082 + 0.002 * k, 0.09, 0.08))) for k in range(30)]
     sure = replace(_object(shapes, [1 / 30] * 30), population=np.zeros(30, np.int32))
-    lost = replace(sure, diagnostics={"failed_populations": 3.0})
+    lost = replace(sure, diagnostics=AnswerDiagnostics(failed_populations=3.0))
     free = Box((-0.14, -0.14, 0.1), (-0.1, -0.1, 0.14))
     assert query([lost], free, "object").p_free_few == pytest.approx(2 / 3)
     assert query([lost], free, "object").verdict(0.3) == "unsure"

@@ -170,7 +170,7 @@ def test_frames_of_a_mug_add_up_as_they_should() -> None:
     # first answers came before the last, from fewer shapes, and say so
     assert answers[-1] is begun.hypotheses and len(answers) >= 2
     assert answers[0].result == "underway" and answers[0].stage < begun.hypotheses.stage
-    assert answers[0].diagnostics["beta"] < 1 <= begun.hypotheses.diagnostics["beta"]
+    assert answers[0].diagnostics.beta < 1 <= begun.hypotheses.diagnostics.beta
 
     # ten pictures from one tripod: no certainty is gained, and no stage is spent
     for i in range(1, 11):

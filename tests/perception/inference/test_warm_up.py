@@ -13,8 +13,9 @@ import pytest
 from benchmarks.scenes.cartons import carton_seeds, half_hidden
 from benchmarks.scenes.conditions import any_view
 from benchmarks.scenes.vessels import vessel_view
+from perception.inference.limits import Callbacks, Limits
 from perception.inference.settings import ControllerConfig
-from perception.inference.tracker import Tracker, Update
+from perception.inference.tracker import Change, Tracker, Update
 from perception.inference.warm_up import _alone, warm_up
 from perception.observation.segmentation import segment
 from perception.sources.recording import Log
@@ -27,7 +28,7 @@ from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.sampling import modes, tempered_smc
 from probnerf.settings import InferConfig, quick_smc
-from probnerf.types import UNKNOWN
+from probnerf.types import UNKNOWN, StopReason
 from tests.node.shapes import body_with_handle
 
 
@@ -35,11 +36,11 @@ def _tracker(monkeypatch: pytest.MonkeyPatch, outcome: str | Exception, then: st
     """A tracker, and what is asked of one like it: looks, inferences and samples, of which none is made."""
     asked: list = []
 
-    def infer_look(self: Tracker, look: Any, **limits: Any) -> Update:
+    def infer_look(self: Tracker, look: Any, limits: Limits, callbacks: Callbacks) -> Update:
         asked.append((self, "infer", look._view.observation))
-        assert limits["stages"] == 1 and limits["on_answer"](None) is None
+        assert limits == Limits(stages=1) and callbacks.on_answer(None) is None
         monkeypatch.setitem(self.__dict__["_tracks"], 1, SimpleNamespace(posterior="its own"))
-        return Update("new", replace(body_with_handle(), result=str(outcome)), 1, 0.0, 0.0)
+        return Update(Change.NEW, replace(body_with_handle(), result=StopReason(outcome)), 1, 0.0, 0.0)
 
     def look(self: Tracker, frame: Any, segment: Any, how: Any = None) -> Any:
         hidden = bool((segment.status == UNKNOWN).any())

@@ -145,7 +145,7 @@ def test_estimate_runs_without_depth() -> None:
     np.testing.assert_array_equal(first.hypotheses.opacity, again.hypotheses.opacity)
     h = first.hypotheses
     assert stages and h.seen.any() and np.isfinite(h.pose).all() and h.object_frame.sight_sigma > 0
-    assert np.isfinite(h.diagnostics["explained"])
+    assert np.isfinite(h.diagnostics.explained)
 
 
 @pytest.mark.slow

@@ -1,0 +1,151 @@
+"""Independent runs of the sampler on one view: where they begin, and what they cost."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from threading import RLock
+
+import jax
+from jaxtyping import Array
+
+from perception.inference.limits import Limits
+from perception.inference.publish import ConditionedView
+from perception.inference.stopwatch import Stopwatch
+from perception.observation.encoder_crop import crop
+from probnerf.inference import asks_encoder, crossings_of, encoder_guess, infer, likelihood_of, modes_of, sampler_of
+from probnerf.likelihood.settings import Likelihood
+from probnerf.prior.checkpoint import Prior
+from probnerf.prior.networks import ProbNeRF
+from probnerf.prior.posterior_network import EncoderPicture
+from probnerf.sampling.gaussian_mixture import GaussianMixture
+from probnerf.sampling.hmc import StageInfo
+from probnerf.settings import InferConfig, TemperedSMCConfig
+from probnerf.types import Posterior, StopReason
+
+# Two batches of eigenvalues may wait for each other for ever: each holds a thread of XLA's pool, one per core, until
+_ONE_AT_A_TIME = RLock()  # another thread of that pool has done its parts (jaxlib's ParallelBatchMap)
+
+
+@dataclass(eq=False)
+class ViewSampler:
+    """Makes runs of the sampler on one view, which begin at the same place, and counts what they cost together.
+
+    That place is `before`, a posterior of the same view that was cut short; or the modes that `climb` finds; or else
+    the prior.
+    """
+
+    view: ConditionedView
+    prior: Prior
+    config: InferConfig  # of one run
+    seed: int
+    limits: Limits  # of all runs together
+    before: Posterior | None = None
+    stopwatch: Stopwatch = field(default_factory=Stopwatch)
+    stages: int = 0  # done
+    point_gradients: float = 0.0  # field evaluations with gradient
+    _reference: GaussianMixture | None = None  # where all runs begin, if not at the prior
+    _stage_s: list[float] = field(default_factory=list)  # s; each stage of the latest run
+
+    @cached_property
+    def likelihood(self) -> Likelihood:
+        """Of the view."""
+        return likelihood_of(self.config, self.view.observation, not self.view.pose_known)
+
+    @property
+    def smc(self) -> TemperedSMCConfig:
+        """Of one run of tempered SMC."""
+        return sampler_of(self.config, self._reference, self.before)
+
+    @property
+    def asks_encoder(self) -> bool:
+        """Whether there is an encoder to ask where the object's modes may be."""
+        tempers_anew = self.config.method == "tempered_smc" and self.before is None
+        return tempers_anew and asks_encoder(self.config, self.prior.model, self._picture)
+
+    @cached_property
+    def _picture(self) -> EncoderPicture | None:
+        """What the encoder sees. Without the ranges that it was trained with there is none, nor where the pose is known
+        (guesses at one yaw climb to poor modes): sampling begins at the prior.
+        """
+        view, model = self.view, self.prior.model
+        if view.pose_known or view.frame.depth is None or not isinstance(model, ProbNeRF):
+            return None
+        return crop(view.frame, view.segment, view.object_frame, model.preset.image_size)
+
+    @property
+    def _key(self) -> Array:
+        return jax.random.key(self.seed)
+
+    def guess(self) -> Posterior:
+        """What the encoder takes the object for, where it may be asked (`asks_encoder`)."""
+        assert isinstance(self.prior.model, ProbNeRF) and self._picture is not None
+        key = jax.random.fold_in(self._key, 1)
+        with self.stopwatch.part("climbing"):
+            return encoder_guess(key, self.prior.model, self.likelihood, self.view.observation, self._picture)
+
+    def climb(self) -> None:
+        """Have all runs begin at the modes that the encoder's guesses climb to."""
+        model, observation, key = self.prior.model, self.view.observation, jax.random.fold_in(self._key, 1)
+        with _ONE_AT_A_TIME, self.stopwatch.part("climbing"):
+            self._reference = jax.block_until_ready(modes_of(key, model, observation, self.config, self._picture))
+        climbed = self.config.modes.gradients(self.likelihood.dim(model))
+        self.point_gradients += climbed * crossings_of(self.likelihood, observation)
+
+    def more_runs(
+        self, done: int, wanted: int, on_stage: Callable[[StageInfo], bool | None]
+    ) -> tuple[list[Posterior], StopReason | None]:
+        """Runs after the first `done` ones until there are as many as wanted, and what ended them before, if anything.
+
+        A run that is cut short is left out, but for the very first, which is better than none.
+        """
+        runs: list[Posterior] = []
+        for number in range(done, wanted):
+            limit = self.limit_reached() if number > 0 else None
+            if limit is not None:
+                return runs, limit
+            run = self.run(number, on_stage)
+            whole = run.result == StopReason.CONVERGED
+            if whole or number == 0:
+                runs.append(run)
+            if not whole:
+                return runs, run.result
+        return runs, None
+
+    def run(self, number: int, on_stage: Callable[[StageInfo], bool | None]) -> Posterior:
+        """One run, of its own random numbers; other threads' wait. `on_stage` is told stages of all runs together."""
+        self._stage_s = []
+        stages = None if self.limits.stages is None else self.limits.stages - self.stages
+        since = 0.0
+
+        def after_stage(info: StageInfo) -> bool | None:
+            nonlocal since
+            self._stage_s.append(time.monotonic() - since)
+            ends = on_stage(replace(info, stage=self.stages + info.stage))
+            since = time.monotonic()
+            return ends
+
+        with _ONE_AT_A_TIME, self.stopwatch.part("sampling"):
+            since = time.monotonic()
+            posterior, _ = infer(
+                jax.random.fold_in(self._key, 10 + number) if number else self._key,
+                self.prior.model,
+                self.view.observation,
+                self.config,
+                reference=self._reference,
+                before=self.before,
+                sample_pose=not self.view.pose_known,
+                on_stage=after_stage,
+                deadline=self.limits.deadline,
+                stages=stages,
+            )
+        self.stages += int(posterior.diagnostics.stages)
+        crossings = crossings_of(self.likelihood, self.view.observation)
+        self.point_gradients += float(posterior.diagnostics.point_gradients) * crossings
+        return posterior
+
+    def limit_reached(self) -> StopReason | None:
+        """Which limit leaves no room for a next run, if one does. It takes as long as the one before, or so: as many
+        stages, and each as long as the shortest.
+        """
+        return self.limits.reached(self.stages, time.monotonic(), len(self._stage_s) * min(self._stage_s, default=0.0))
