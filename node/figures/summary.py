@@ -55,11 +55,11 @@ def diagnostics(h: Hypotheses) -> dict[str, str]:
     populations = len(np.unique(h.population)) + h.failed
     return {
         "stopped": f"{h.result}, stage {h.stage}",
-        "ESS": _number(d.get("ess", np.nan), ".0f"),
+        "ESS": _number(d.ess, ".0f"),
         "log evidence": f"{evidence:.1f} ± {_number(error, '.1f')} nats" if np.isfinite(evidence) else "none",
-        "acceptance": _number(d.get("acceptance", np.nan), ".2f"),
-        "R-hat": _number(d.get("r_hat", np.nan), ".2f"),
-        "divergences": _number(d.get("divergences", np.nan), ".0f"),
+        "acceptance": _number(d.acceptance, ".2f"),
+        "R-hat": _number(d.r_hat, ".2f"),
+        "divergences": _number(d.divergences, ".0f"),
         "failed populations": f"{h.failed} of {populations}",
     }
 

@@ -55,6 +55,12 @@ def pretend(frame: Frame, found: Segment, prior: Prior, config: ControllerConfig
     return Estimate(h, None, None, None, h.object_frame, 0.1)
 
 
+def pretend_view(
+    view: ConditionedView, prior: Prior, config: ControllerConfig, seed: int, limits: Limits, **_: Any
+) -> Estimate:
+    return pretend(view.frame, view.segment, prior, config, seed=seed, stages=limits.stages)
+
+
 def record_session(folder: Path, first: Frame, infer: Callable[..., Estimate]) -> Session:
     """A prior, a configuration, a log of three frames with a schedule, and what was inferred while it was made."""
     save_prior(folder / "tiny.safetensors", ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {})
@@ -88,11 +94,6 @@ def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def pretending(monkeypatch: pytest.MonkeyPatch) -> None:
-    def pretend_view(
-        view: ConditionedView, prior: Prior, config: ControllerConfig, seed: int, limits: Limits, **_: Any
-    ) -> Estimate:
-        return pretend(view.frame, view.segment, prior, config, seed=seed, stages=limits.stages)
-
     monkeypatch.setattr(perception.inference.tracker, "infer_view", pretend_view)
 
 

@@ -16,17 +16,14 @@ from node.commands.replay import ReplayConfig
 from perception.answers.hypotheses_file import load, save
 from perception.answers.query import query
 from perception.answers.regions import Box
-from perception.inference.controller import Estimate
 from perception.inference.limits import Limits
-from perception.inference.publish import ConditionedView
 from perception.inference.schedule import config_hash, digest, scheduled
-from perception.inference.settings import ControllerConfig
 from perception.inference.tracker import Tracker
 from perception.observation.segmentation import segment
 from perception.sources.recorder import Recorder
-from probnerf.prior.checkpoint import Prior, load_prior, save_prior
+from probnerf.prior.checkpoint import load_prior, save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
-from tests.node.commands.test_replay_schedule import pretend
+from tests.node.commands.test_replay_schedule import pretend_view
 from tests.node.commands.test_replay_whole import FEW
 from tests.node.shapes import body_with_handle
 from tests.perception.cylinders import Cylinder, picture
@@ -81,10 +78,6 @@ def test_a_schedule_repeats_the_object_that_it_names(
     wanted: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     """Nobody labels the objects. The second that came is the larger one, which segmentation puts first."""
-
-    def pretend_view(view: ConditionedView, prior: Prior, config: ControllerConfig, **limits: Any) -> Estimate:
-        return pretend(view.frame, view.segment, prior, config, **limits)
-
     monkeypatch.setattr(perception.inference.tracker, "infer_view", pretend_view)
     monkeypatch.setattr("node.commands.replay.draw_object", lambda path, *_: path.touch())
     save_prior(tmp_path / "tiny.safetensors", ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {})
