@@ -41,10 +41,10 @@ def published(
     prior: Prior,
     config: PublishConfig,
     seed: int,
-    point_gradients: float,
-    evidence_power: float,
+    point_gradients: float = float("nan"),
+    evidence_power: float = float("nan"),
 ) -> Hypotheses:
-    """A posterior as planners read it. The last two are told on (`AnswerDiagnostics`)."""
+    """A posterior as planners read it. The last two become diagnostics of it."""
     chosen, weights, population = thin(posterior, config.hypotheses)
     sizeless = without_sizes(likelihood)
     # NumPy: how many there are to choose from varies, and nothing may compile for it

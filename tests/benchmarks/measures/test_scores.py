@@ -60,7 +60,7 @@ def test_shapes_are_those_that_are_published(vessel):
     config = question.config
     seen = seen_voxels(vessel.frame, vessel.segment, cube, config.grid)
     view = ConditionedView(vessel.frame, vessel.segment, observation, cube, seen)
-    h = published(view, posterior, likelihood, question.prior, config, 0, {})
+    h = published(view, posterior, likelihood, question.prior, config, 0)
     assert len(h.weights) == 8  # all of them, in their order
     asked = jnp.asarray(answered_voxels(vessel.frame, vessel.segment, cube, config.grid))
     shapes = shapes_at(model, likelihood, positions, observation.pose_sigma, asked)
