@@ -12,6 +12,7 @@ from calibration.camera import Camera
 from perception.answers.hypotheses import Hypotheses
 from perception.observation.object_frame import ObjectFrame
 from probnerf.geometry import look_at, pinhole_rays
+from probnerf.rendering.voxel_rays import met, nearest
 from probnerf.types import BASE_Z, FREE, OBJECT, UNKNOWN
 
 RADIUS = 1.15  # a picture shows this much around the cube's centre
@@ -91,12 +92,12 @@ def shade(
     low = np.asarray(solid[:, :, : int(0.3 * solid.shape[2])].any(axis=2), np.float32)
     for _ in range(3):
         low = _blurred(low)
-    rgb[lit] = _GROUND * (1.0 - 0.35 * _nearest(low, *on_ground[lit][:, :2].T))[:, None]
+    rgb[lit] = _GROUND * (1.0 - 0.35 * nearest(np.pad(low, 1), *on_ground[lit][:, :2].T))[:, None]
     t, normals = march(solid, view)
     hit = np.isfinite(t) & ~(ground < t - 0.03)
     points = view.origin + t[hit, None] * view.directions[hit]
     # Was the space in front of the surface seen? The surface itself is within the noise of depth.
-    seen = _nearest(h.seen, *(points + 2.5 / solid.shape[0] * normals[hit]).T)
+    seen = nearest(np.pad(h.seen, 1), *(points + 2.5 / solid.shape[0] * normals[hit]).T)
     paint = np.where(seen[:, None], SEEN, UNSEEN)
     T = view.T_cube_camera
     light = T[:3, :3] @ np.array([-0.5, -0.7, -0.6])  # to the left, up, towards the viewer
@@ -116,21 +117,12 @@ def march(solid: Bool[np.ndarray, "G G G"], view: Viewpoint) -> tuple[Float[np.n
     field = _blurred(solid.astype(np.float32))
     occupied = np.argwhere(solid)
     low, high = -1.0 + (occupied.min(axis=0) - 1) * 2.0 / grid, -1.0 + (occupied.max(axis=0) + 2) * 2.0 / grid
-    near, far = _box(view, low, high)
-    crosses = np.flatnonzero(far > near)
     step = _STEP * 2.0 / grid
-    t = near[crosses, None] + step * np.arange(int(np.ceil((far - near)[crosses].max() / step)) + 1)
-    inside, core = np.zeros(t.shape, bool), field >= 0.5
-    origin, directions = view.origin.astype(np.float32), view.directions.astype(np.float32)
-    for rows in np.array_split(np.arange(len(crosses)), max(1, t.size // 500_000)):
-        at = t[rows].astype(np.float32)
-        inside[rows] = _nearest(
-            core, *(at * d[:, None] + o for o, d in zip(origin, directions[crosses[rows]].T, strict=True))
-        )
-    first = inside.argmax(axis=1)
-    rows = np.flatnonzero(inside.any(axis=1))
-    chosen, after = crosses[rows], t[rows, first[rows]]
-    before, after = after - 1.5 * step, after + 0.5 * step
+    for rays, t, inside in met(np.pad(field >= 0.5, 1), view.origin, view.directions, _STEP, low=low, high=high):
+        hit = np.flatnonzero(inside.any(axis=1))
+        t_hit[rays[hit]] = t[hit, inside[hit].argmax(axis=1)]
+    chosen = np.flatnonzero(np.isfinite(t_hit))
+    before, after = t_hit[chosen] - 1.5 * step, t_hit[chosen] + 0.5 * step
     for _ in range(6):  # bisection, on the field between voxel centres
         middle = 0.5 * (before + after)
         beyond = _trilinear(field, view.origin + middle[:, None] * view.directions[chosen]) >= 0.5
@@ -146,14 +138,9 @@ def march(solid: Bool[np.ndarray, "G G G"], view: Viewpoint) -> tuple[Float[np.n
 
 def largest_along(values: Float[np.ndarray, "G G G"], view: Viewpoint) -> Float[np.ndarray, "s s"]:
     """The largest value that each ray meets in the cube (0 where it meets none)."""
-    near, far = _box(view, np.full(3, -1.0), np.full(3, 1.0))
-    step = 2.0 / values.shape[0]
-    out = np.zeros(len(near))
-    crosses = np.flatnonzero(far > near)
-    for rows in np.array_split(crosses, max(1, len(crosses) // 8000)):
-        t = near[rows, None] + step * np.arange(int(np.ceil((far - near)[rows].max() / step)) + 1)
-        at = (o + t * d[:, None] for o, d in zip(view.origin, view.directions[rows].T, strict=True))
-        out[rows] = _nearest(values, *at).max(axis=1)
+    out = np.zeros(len(view.directions))
+    for rays, _, along in met(np.pad(values, 1), view.origin, view.directions, 1.0):
+        out[rays] = along.max(axis=1)
     return out.reshape(view.size, view.size)
 
 
@@ -163,15 +150,6 @@ def _meet_ground(view: Viewpoint, base: float) -> Float[np.ndarray, "n"]:
     return np.where(t > 0, t, np.inf)
 
 
-def _box(
-    view: Viewpoint, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Where each ray enters and leaves a box; enters after it leaves where it misses."""
-    d = np.where(np.abs(view.directions) < 1e-9, 1e-9, view.directions)
-    a, b = (low - view.origin) / d, (high - view.origin) / d
-    return np.maximum(np.minimum(a, b).max(axis=1), 0.0), np.maximum(a, b).min(axis=1)
-
-
 def _blurred(field: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """[1 2 1] / 4 along every axis; outside is 0."""
     for axis in range(field.ndim):
@@ -179,15 +157,6 @@ def _blurred(field: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         wide = np.moveaxis(wide, axis, 0)
         field = np.moveaxis(0.25 * wide[:-2] + 0.5 * wide[1:-1] + 0.25 * wide[2:], 0, axis)
     return field
-
-
-def _nearest(values: np.ndarray, *coordinates: Float[np.ndarray, "..."]) -> np.ndarray:
-    """The voxel's value at points of the cube (or square) given by their coordinates; zero outside."""
-    grid = values.shape[0]
-    index = np.zeros((), np.int32)
-    for p in coordinates:  # into a copy with a border of zeros, which clipping leads to
-        index = index * (grid + 2) + np.clip((p + 1.0) * (0.5 * grid) + 1.0, 0, grid + 1).astype(np.int32)
-    return np.pad(values, 1).ravel()[index]
 
 
 def _trilinear(values: Float[np.ndarray, "G G G"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:

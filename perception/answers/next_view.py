@@ -15,12 +15,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt64
+from jaxtyping import Bool, Float, Float32, UInt64
 
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.query import check_one_frame
 from probnerf.geometry import look_at, pinhole_rays, rigid
-from probnerf.rendering.occupancy import voxel_index
+from probnerf.rendering.voxel_rays import met
 
 _HALF = 1.1  # cube units that a picture shows on each side of the cube's centre
 
@@ -114,7 +114,7 @@ def _gains(
     All hypotheses explain the present view, and another picture from there would share its errors. So its distances,
     which are those of samples that it cannot tell apart, set the unit in which another view's are counted.
     """
-    words = _words(h)
+    words = packed(h.solid)
     present = np.linalg.inv(h.object_frame.T_camera_object)
     w = h.weights
     unit = float(w @ _distances(h, words, present, config) @ w)
@@ -128,7 +128,7 @@ def _gains(
 
 def _distances(
     h: Hypotheses,
-    words: list[UInt64[np.ndarray, "V"]],
+    words: list[UInt64[np.ndarray, "g g g"]],
     T_object_camera: Float[np.ndarray, "4 4"],
     config: NextViewConfig,
 ) -> Float[np.ndarray, "S S"]:
@@ -139,8 +139,8 @@ def _distances(
     at = T_object_camera[:3, 3] / h.object_frame.half_extent
     distance = max(float(np.linalg.norm(at)), 1e-6)
     T = look_at(at, np.zeros(3))  # the object is kept in the picture's middle: any camera is turned to it
-    origin, direction = pinhole_rays(T, 0.5 * config.pixels * distance / _HALF, config.pixels)
-    ranges = first_hits(words, h.grid, len(h.weights), origin, direction)
+    _, directions = pinhole_rays(T, 0.5 * config.pixels * distance / _HALF, config.pixels)
+    ranges = first_hits(words, len(h.weights), T[:3, 3], directions)
     ranges = ranges[np.isfinite(ranges).any(axis=1)]
     hit, depth = np.isfinite(ranges), np.nan_to_num(ranges, posinf=0.0)
     most = -math.log(2.0 * math.sqrt(config.mask_error * (1.0 - config.mask_error)))
@@ -150,39 +150,30 @@ def _distances(
 
 
 def first_hits(
-    words: list[UInt64[np.ndarray, "V"]],
-    grid: int,
+    words: list[UInt64[np.ndarray, "g g g"]],
     count: int,
-    origin: Float[np.ndarray, "n 3"],
-    direction: Float[np.ndarray, "n 3"],
+    origin: Float[np.ndarray, "3"],
+    directions: Float[np.ndarray, "n 3"],
 ) -> Float32[np.ndarray, "n S"]:
-    """Distance (cube units, to a voxel) along each ray to each hypothesis (see `_words`); infinite: missed."""
-    step = 2.0 / grid
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ends = (np.array([[[-1.0]], [[1.0]]]) - origin) / direction
-    near = np.maximum(np.nan_to_num(ends.min(axis=0), nan=-np.inf).max(axis=1), 0.0)
-    far = np.nan_to_num(ends.max(axis=0), nan=np.inf).min(axis=1)
-    t = near[:, None] + step * (np.arange(math.ceil(2.0 * math.sqrt(3.0) / step)) + 0.5)
-    voxel = np.where(t < far[:, None], voxel_index(origin[:, None] + t[..., None] * direction[:, None], grid), -1)
-    ranges = np.full((len(origin), count), np.inf, np.float32)
+    """Distance (cube units, to a voxel) along each ray to each of `count` shapes (`packed`); infinite: missed."""
+    ranges = np.full((len(directions), count), np.inf, np.float32)
     for start, word in enumerate(words):
-        held = np.where(voxel >= 0, word[voxel], np.uint64(0))
-        before = np.bitwise_or.accumulate(held, axis=1)
-        held[:, 1:] &= ~before[:, :-1]  # the hypotheses that the ray meets here for the first time
-        ray, at = np.nonzero(held)
-        for bit in range(min(64, count - 64 * start)):
-            first = (held[ray, at] >> np.uint64(bit)) & np.uint64(1) == 1
-            ranges[ray[first], 64 * start + bit] = t[ray[first], at[first]]
+        for rays, t, held in met(word, origin, directions, 1.0, first=0.5):
+            before = np.bitwise_or.accumulate(held, axis=1)
+            held[:, 1:] &= ~before[:, :-1]  # the shapes that the ray meets here for the first time
+            ray, at = np.nonzero(held)
+            for bit in range(min(64, count - 64 * start)):
+                first = (held[ray, at] >> np.uint64(bit)) & np.uint64(1) == 1
+                ranges[rays[ray[first]], 64 * start + bit] = t[ray[first], at[first]]
     return ranges
 
 
-def _words(h: Hypotheses) -> list[UInt64[np.ndarray, "V"]]:
-    """Which hypotheses fill each voxel, 64 of them a word: one look-up tells of all."""
-    solid = h.solid.reshape(len(h.weights), -1)
+def packed(solid: Bool[np.ndarray, "S G G G"]) -> list[UInt64[np.ndarray, "g g g"]]:
+    """Which shapes fill each voxel, 64 of them a word: one look-up tells of all. With a border, for `met`."""
     words = []
     for start in range(0, len(solid), 64):
-        word = np.zeros(solid.shape[1], np.uint64)
+        word = np.zeros(solid.shape[1:], np.uint64)
         for bit, shape in enumerate(solid[start : start + 64]):
             word |= shape.astype(np.uint64) << np.uint64(bit)
-        words.append(word)
+        words.append(np.pad(word, 1))
     return words

@@ -7,8 +7,7 @@ import pytest
 
 from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
-from perception.answers.next_view import _words as words_of
-from perception.answers.next_view import first_hits, rank_views, ring_of_views
+from perception.answers.next_view import first_hits, packed, rank_views, ring_of_views
 from perception.observation.object_frame import ObjectFrame
 from probnerf.geometry import look_at
 from probnerf.rendering.occupancy import voxel_centres
@@ -91,7 +90,8 @@ def test_a_ray_meets_each_hypothesis_where_its_voxels_begin() -> None:
     h = object_of(*[rng.random((GRID,) * 3) < 0.02 for _ in range(70)], weights=[1 / 70] * 70)
     origin = np.array([[2.0, 0.3, 0.1], [0.2, -2.0, 0.4], [0.0, 0.0, 3.0]])
     direction = -origin / np.linalg.norm(origin, axis=1, keepdims=True)
-    found = first_hits(words_of(h), GRID, 70, origin, direction)
+    words = packed(h.solid)
+    found = np.concatenate([first_hits(words, 70, o, d[None]) for o, d in zip(origin, direction, strict=True)])
     t = np.arange(0.0, 6.0, 1e-3)
     for ray in range(3):
         p = origin[ray] + t[:, None] * direction[ray]
