@@ -7,10 +7,12 @@ Chopin 2022). Then beta takes the longest step that keeps the effective sample s
 (prior x L / r)^(step) (conditional ESS, Zhou, Johansen and Aston 2016), and systematic resampling draws the next
 particles from it. The product of the mean weights estimates the evidence.
 
-What tunes moves is never read off the states about to move. A population's metric is its neighbour's; the step size of
-every other particle comes from how often the rest of its own population was accepted (a neighbour may be in a mode of
-another width, and with its steps a population would stand still). Beta waits until a population has moved: copies that
-resampling made agree with each other, and would let it run ahead.
+What tunes a move is not read off the states about to move. A population's metric is its neighbour's; the step size of
+every other particle comes from how often the rest of its own population was accepted at the move before (a neighbour
+may be in a mode of another width, and with its steps a population would stand still). Later moves depend on earlier
+ones through both halves, so this is exact as the number of particles grows. On a target of two widths the mass within
+1 was off by 0.004 (two standard errors) after 24 moves with 8 particles, and by 0.02 (ten) with 2. Beta waits until a
+population has moved: copies that resampling made agree with each other, and would let it run ahead.
 """
 
 import time
