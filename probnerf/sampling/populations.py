@@ -42,10 +42,10 @@ def gathered(
     log_evidences: Float[np.ndarray, "m"],
     variance: Float[np.ndarray, "m"],
     evidence_power: float,
-    told: dict[str, Array],
+    others: dict[str, Array],
     result: StopReason,
 ) -> Posterior:
-    """The pools [m, n, ...] of a run's last stages as one posterior; `told` is what else its diagnostics say.
+    """The pools [m, n, ...] of a run's last stages as one posterior; `others` are its further diagnostics.
 
     `variance` is that of each evidence estimate, were the particles of a population independent.
     """
@@ -83,7 +83,7 @@ def gathered(
             ess=jax.device_put(np.float32(1.0 / np.sum(np.exp(2.0 * log_weights)))),
             beta=jax.device_put(np.asarray(beta, np.float32)),
             log_evidences=jax.device_put(np.asarray(log_evidences, np.float32)),
-            **told,
+            **others,
         ),
         result=result,
     )

@@ -19,12 +19,11 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logsumexp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from probnerf.compile_cache import program
 from probnerf.sampling.hmc import (
@@ -37,30 +36,11 @@ from probnerf.sampling.hmc import (
     gradient_metric,
     hmc_step,
 )
-from probnerf.sampling.populations import gathered, log_prior
+from probnerf.sampling.populations import log_prior
 from probnerf.sampling.resampling import choose, next_beta
+from probnerf.sampling.smc_record import SMCRecord, SMCState, StageStats
 from probnerf.settings import TemperedSMCConfig
 from probnerf.types import Posterior, StopReason
-
-
-class _State(eqx.Module):
-    """m populations of p particles, resampled at beta and not yet moved there."""
-
-    chain: HMCState
-    beta: Float[Array, "m"]
-    log_evidence: Float[Array, "m"]  # of the target at beta
-    variance: Float[Array, "m"]  # of log_evidence, were all particles of a pool independent: sum of 1 / ESS - 1 / size
-    ancestor: Int[Array, "m p"]  # index of the initial particle
-    step_size: Float[Array, "m 2"]  # of every other particle, tuned on the others
-    metric: Metric  # with a leading axis m
-    moved: Float[Array, "m"]  # accepted moves of a particle, on average, since beta was raised
-
-
-class _Info(eqx.Module):
-    ess: Float[Array, "m"]
-    acceptance: Float[Array, "m"]  # mean over the stage
-    step_size: Float[Array, "m"]  # the last one used
-    divergences: Int[Array, ""]
 
 
 def _metrics(force, log_w, config: TemperedSMCConfig) -> Metric:
@@ -71,25 +51,36 @@ def _metrics(force, log_w, config: TemperedSMCConfig) -> Metric:
     return metric if config.metric else Metric(metric.basis, jnp.ones_like(metric.frequency))
 
 
-@program("log_likelihood", "config")
-def _start(key, args, q0, log_w0, reference, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig):
-    """Importance step from q0 [m, p0, d], whose weights for the reference are exp(log_w0), to the first beta > 0."""
+def _log_ratio_at_starts(target: Target, q0, log_w0, config: TemperedSMCConfig) -> Float[Array, "m p0"]:
+    """log of (prior x likelihood) / reference at starts q0 [m, p0, d]; -inf where a start has no weight.
+
+    In chunks as wide as every later evaluation, so that a large start takes no more memory. Gradients are evaluated of
+    the chosen ones only.
+    """
     populations, count, dim = q0.shape
     chunks = -(-count // config.particles)
     padded = jnp.pad(q0, ((0, 0), (0, chunks * config.particles - count), (0, 0)))
     padded = padded.reshape(populations, chunks, config.particles, dim).swapaxes(0, 1)
-    target = Target(log_likelihood, args, jnp.zeros(()), None, reference)
-    # Chunks as wide as every later evaluation, so that a large start takes no more memory; gradients of the chosen only
     value = jax.lax.map(target.value, padded).swapaxes(0, 1).reshape(populations, -1)[:, :count]
     value = jnp.where(jnp.isfinite(log_w0), value, -jnp.inf)
+    reference = target.reference
     if reference is not None:  # the next step's weights are of likelihood x prior over it
         value = value - reference.over_prior(q0.reshape(-1, dim)).reshape(value.shape)
+    return value
+
+
+@program("log_likelihood", "config")
+def _start(key, args, q0, log_w0, reference, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig):
+    """Importance step from q0 [m, p0, d], whose weights for the reference are exp(log_w0), to the first beta > 0."""
+    populations, count, _ = q0.shape
+    target = Target(log_likelihood, args, jnp.zeros(()), None, reference)
+    value = _log_ratio_at_starts(target, q0, log_w0, config)
     enough = config.ess_target * config.particles  # a number, so that a larger start buys a longer first step
     beta, log_w, ess = jax.vmap(lambda w, v: next_beta(jnp.zeros(()), w, v, enough))(log_w0, value)
     ancestor = jnp.broadcast_to(jnp.arange(count), log_w.shape)
     position, ancestor = choose(key, log_w, (q0, ancestor), config.particles)
     chain = target.evaluate(position)
-    state = _State(
+    state = SMCState(
         chain=chain,
         beta=beta,
         log_evidence=logsumexp(log_w, axis=1) - np.log(count),
@@ -101,13 +92,37 @@ def _start(key, args, q0, log_w0, reference, *, log_likelihood: LogLikelihood, c
         metric=_metrics(chain.force(beta[:, None]), jnp.zeros(ancestor.shape), config),
         moved=jnp.zeros(populations),
     )
-    return state, _Info(ess, jnp.full(populations, jnp.nan), state.step_size[:, 0], jnp.zeros((), jnp.int32))
+    return state, StageStats(ess, jnp.full(populations, jnp.nan), state.step_size[:, 0], jnp.zeros((), jnp.int32))
 
 
 @program("log_likelihood", "config")
-def _stage(key, state: _State, args, reference, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig):
+def _stage(key, state: SMCState, args, reference, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig):
     """`moves` iterations at the present beta, then the step to the next beta and resampling (at beta = 1: neither)."""
     target = Target(log_likelihood, args, state.beta[:, None], state.metric, reference)
+    move_key, resample_key = jax.random.split(key)
+    (chain, step), (pool, acceptance, steps, divergences) = _hmc_moves(move_key, state, target, config)
+    moved = state.moved + jnp.sum(acceptance, axis=0)
+    held = moved < config.least_moved
+    beta, log_w, ess = _next_temperature(state.beta, pool, held, config)
+    tempering = state.beta < 1
+    ancestors = state.ancestor
+    chain, ancestor = _resampled(resample_key, log_w, pool, ancestors, (chain, ancestors), tempering, config)
+    log_evidence, variance = _evidence(state, log_w, ess, tempering)
+    beta = jnp.where(tempering, beta, 1.0)
+    metric = _metrics(pool.force(beta[:, None]), log_w, config)
+    moved = jnp.where(held, moved, 0.0)
+    state = SMCState(chain, beta, log_evidence, variance, ancestor, step, metric, moved)
+    ess = jnp.where(tempering, ess, jnp.nan)
+    return state, StageStats(ess, jnp.mean(acceptance, axis=0), steps[-1], jnp.sum(divergences)), pool
+
+
+def _hmc_moves(key, state: SMCState, target: Target, config: TemperedSMCConfig):
+    """`moves` HMC iterations of every particle: (chains and step sizes after the last), (pool of the states after each
+    [m, moves p], acceptance [moves, m], mean step size [moves, m], divergences [moves]).
+
+    After each iteration log(step) of every other particle grows by 2 (acceptance - target) with the acceptance of the
+    rest of its population, so that no step size depends on the states that it moves.
+    """
     half = jnp.arange(config.particles) % 2
 
     def move(carry, key):
@@ -117,37 +132,44 @@ def _stage(key, state: _State, args, reference, *, log_likelihood: LogLikelihood
         tuned = jnp.minimum(step * jnp.exp(2.0 * (acceptance - config.target_acceptance)), config.longest_step)
         return (chain, tuned[:, ::-1]), (chain, acceptance.mean(axis=1), step.mean(axis=1), jnp.sum(info.divergent))
 
-    move_key, resample_key = jax.random.split(key)
-    (chain, step), (pool, acceptance, steps, divergences) = jax.lax.scan(
-        move, (state.chain, state.step_size), jax.random.split(move_key, config.moves)
-    )
+    after, (pool, *stats) = jax.lax.scan(move, (state.chain, state.step_size), jax.random.split(key, config.moves))
     # [moves, m, p, ...] -> [m, moves p, ...]
     pool = jax.tree.map(lambda a: a.swapaxes(0, 1).reshape(config.populations, -1, *a.shape[3:]), pool)
+    return after, (pool, *stats)
+
+
+def _next_temperature(beta, pool: HMCState, held, config: TemperedSMCConfig):
+    """Each population's next beta, the weights of its pool for it (log) and their effective sample size.
+
+    The weights are (prior x likelihood / reference)^step, the step the longest that keeps the share `ess_target` of the
+    pool (CESS = (sum w)^2 / sum w^2 of
+    even weights: Zhou, Johansen and Aston 2016). Where `held`, there is no step:
+    copies that have not moved agree with each other, and their weights would let beta run ahead of them.
+    """
     size = config.moves * config.particles
-    beta, log_w, ess = jax.vmap(lambda b, v: next_beta(b, jnp.zeros(size), v, config.ess_target * size))(
-        state.beta, pool.log_ratio
+    new, log_w, ess = jax.vmap(lambda b, v: next_beta(b, jnp.zeros(size), v, config.ess_target * size))(
+        beta, pool.log_ratio
     )
-    # copies that have not moved agree with each other: their weights would let beta run ahead of them
-    moved = state.moved + jnp.sum(acceptance, axis=0)
-    held = moved < config.least_moved
-    beta, ess = jnp.where(held, state.beta, beta), jnp.where(held, size, ess)
-    log_w = jnp.where(held[:, None], 0.0, log_w)
-    ancestor = jnp.tile(state.ancestor, (1, config.moves))
-    chosen = choose(resample_key, log_w, (pool, ancestor), config.particles)
-    tempering = state.beta < 1
-    chain, ancestor = jax.tree.map(
-        lambda a, b: jnp.where(tempering.reshape(-1, *[1] * (a.ndim - 1)), a, b), chosen, (chain, state.ancestor)
-    )
+    return jnp.where(held, beta, new), jnp.where(held[:, None], 0.0, log_w), jnp.where(held, size, ess)
+
+
+def _resampled(key, log_w, pool: HMCState, ancestor, unchanged, tempering, config: TemperedSMCConfig):
+    """The next particles and their ancestors: drawn from the weighted pool by systematic resampling, in a population
+    that is tempering; the `unchanged` ones in another.
+    """
+    chosen = choose(key, log_w, (pool, jnp.tile(ancestor, (1, config.moves))), config.particles)
+    return jax.tree.map(lambda a, b: jnp.where(tempering.reshape(-1, *[1] * (a.ndim - 1)), a, b), chosen, unchanged)
+
+
+def _evidence(state: SMCState, log_w, ess, tempering):
+    """log Z += log(mean weight of the pool) (Del Moral, Doucet and Jasra 2006), and the variance of log Z, as if the
+    particles of a pool were independent, += 1 / ESS - 1 / size. At beta = 1 neither grows.
+    """
+    size = log_w.shape[1]
     log_evidence = jnp.where(
         tempering, state.log_evidence + logsumexp(log_w, axis=1) - np.log(size), state.log_evidence
     )
-    variance = jnp.where(tempering, state.variance + 1.0 / ess - 1.0 / size, state.variance)
-    beta = jnp.where(tempering, beta, 1.0)
-    metric = _metrics(pool.force(beta[:, None]), log_w, config)
-    moved = jnp.where(held, moved, 0.0)
-    state = _State(chain, beta, log_evidence, variance, ancestor, step, metric, moved)
-    info = _Info(jnp.where(tempering, ess, jnp.nan), jnp.mean(acceptance, axis=0), steps[-1], jnp.sum(divergences))
-    return state, info, pool
+    return log_evidence, jnp.where(tempering, state.variance + 1.0 / ess - 1.0 / size, state.variance)
 
 
 @program("shape")
@@ -198,72 +220,46 @@ def tempered_smc(
 
     After each stage `on_stage` is told of it, may ask for the samples so far, and ends the run by answering True.
 
-    result: "converged" (beta = 1 and all final stages), else "budget", "stages", "stopped" (by `on_stage`) or
-    "interrupted" (Ctrl-C); "underway" in samples asked for between stages. A run stopped before beta = 1 hands back
+    The result (`StopReason`) is CONVERGED at beta = 1 after all final stages. A run stopped before beta = 1 hands back
     equally weighted draws of the tempered target, which is wider than the posterior, and NaN for the evidence.
     `point_gradients` counts gradient evaluations of whole positions; the starts are only evaluated, but for the chosen.
     """
     config = config or TemperedSMCConfig()
     begun = time.monotonic()
     start_key, prior_key, key = jax.random.split(key, 3)
-    shape = (config.populations, config.start_particles, dim)
-    if initial is not None and reference is not None:
-        raise ValueError("tempered_smc: give initial positions or a reference, not both")
-    if reference is not None:
-        q0, log_w0 = _reference_start(prior_key, reference, shape=shape)
-    elif initial is None:
-        q0, log_w0 = _prior_start(prior_key, shape=shape)
-    else:
-        q0, log_w0 = _proposal_start(*_checked(initial, config, dim))
-    state, info = _start(start_key, args, q0, log_w0, reference, log_likelihood=log_likelihood, config=config)
-
-    gradients = float(config.populations * config.particles)
-    kept: list[HMCState] = []  # the pools of the final stages
+    q0, log_w0 = _starts(prior_key, initial, reference, dim, config)
+    state, stats = _start(start_key, args, q0, log_w0, reference, log_likelihood=log_likelihood, config=config)
+    record = SMCRecord(config, state, stats, begun)
     cap = config.max_stages if stages is None else min(stages, config.max_stages)
-    done, divergences, shortest, acceptance, result = 0, 0, float("inf"), float("nan"), StopReason.CONVERGED
-
-    def samples(result: StopReason = StopReason.UNDERWAY) -> Posterior:
-        chains = kept or [state.chain]
-        told = {
-            "acceptance": jax.device_put(np.float32(acceptance)),
-            "divergences": jax.device_put(np.int32(divergences)),
-            "ancestors": jax.device_put(np.int32(sum(len(np.unique(row)) for row in np.asarray(state.ancestor)))),
-            "stages": jax.device_put(np.int32(done)),
-            "point_gradients": jax.device_put(np.float32(gradients)),
-        }
-        beta, evidence, variance = (np.asarray(a, np.float64) for a in (state.beta, state.log_evidence, state.variance))
-        return gathered(chains[-config.keep :], beta, evidence, variance, config.evidence_power, told, result)
-
+    result = StopReason.CONVERGED
     try:
         while True:
-            divergences += int(info.divergences)
-            ended = len(kept) == config.final_stages
-            if on_stage is not None:
-                told = _progress(done, state, info, divergences, time.monotonic() - begun, samples)
-                if on_stage(told) and not ended:
-                    result = StopReason.STOPPED
-                    break
-            if ended:
+            ended = on_stage is not None and on_stage(record.stage_info())
+            if record.complete:
+                break
+            limit = StopReason.STOPPED if ended else record.limit_reached(cap, deadline)
+            if limit is not None:
+                result = limit
                 break
             now = time.monotonic()
-            expected = shortest if done > 1 else 0.0
-            if done >= cap or (deadline is not None and now + expected > deadline):
-                result = StopReason.STAGES if done >= cap else StopReason.BUDGET
-                break
-            final = bool(np.all(np.asarray(state.beta) == 1.0))
-            state, info, pool = _stage(
-                jax.random.fold_in(key, done), state, args, reference, log_likelihood=log_likelihood, config=config
-            )
-            acceptance = float(np.mean(np.asarray(info.acceptance)))  # waits for the device
-            if final:
-                kept = [*kept, pool]
-            done += 1
-            seconds = time.monotonic() - now
-            shortest = shortest if done == 1 else min(shortest, seconds)
-            gradients += config.populations * config.particles * config.moves * config.leapfrog_steps
+            stage_key = jax.random.fold_in(key, record.stages)
+            made = _stage(stage_key, record.state, args, reference, log_likelihood=log_likelihood, config=config)
+            record.add(*made, now)
     except KeyboardInterrupt:
         result = StopReason.INTERRUPTED
-    return samples(result)
+    return record.posterior(result)
+
+
+def _starts(key, initial, reference: Reference | None, dim: int, config: TemperedSMCConfig):
+    """Positions [m, p0, d] to start from, and the logarithms of their weights for the reference [m, p0]."""
+    if initial is not None and reference is not None:
+        raise ValueError("tempered_smc: give initial positions or a reference, not both")
+    shape = (config.populations, config.start_particles, dim)
+    if reference is not None:
+        return _reference_start(key, reference, shape=shape)
+    if initial is None:
+        return _prior_start(key, shape=shape)
+    return _proposal_start(*_checked(initial, config, dim))
 
 
 def _checked(initial, config: TemperedSMCConfig, dim: int):
@@ -276,20 +272,3 @@ def _checked(initial, config: TemperedSMCConfig, dim: int):
     if log_q0.shape != q0.shape[:2]:
         raise ValueError(f"initial log-densities have shape {log_q0.shape}; the positions want {q0.shape[:2]}")
     return q0, log_q0
-
-
-def _progress(stage: int, state: _State, info: _Info, divergences: int, seconds: float, samples) -> StageInfo:
-    def row(a) -> tuple[float, ...]:
-        return tuple(np.asarray(a).tolist())
-
-    return StageInfo(
-        stage=stage,
-        beta=row(state.beta),
-        ess=row(info.ess),
-        acceptance=row(info.acceptance),
-        step_size=row(info.step_size),
-        log_evidence=row(state.log_evidence),
-        divergences=divergences,
-        seconds=seconds,
-        samples=samples,
-    )
