@@ -6,60 +6,69 @@ A command's code is imported when it runs, so that help and mistyped options ans
 import os
 import signal
 import sys
+from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import fields
 from importlib.metadata import version
-from typing import Any, NoReturn, TypeVar
+from pathlib import Path
+from typing import NoReturn, TypeVar
 
 import tyro
 from rich.console import Console
 
-from node.options import Calibrate, Capture, Live, Query, Record, Replay, View
+from node.commands.options import (
+    Calibrate,
+    Capture,
+    LiveConfig,
+    Query,
+    Record,
+    ReplayConfig,
+    Training,
+    View,
+    options_of,
+)
 from probnerf.environment import prepare
 
-Options = TypeVar("Options")
+Config = TypeVar("Config", ReplayConfig, LiveConfig)
 
 DESCRIPTION = """Farside: from one partial RGB-D view of an object, several whole, weighted shapes, and the probability
 that any space the camera cannot see is occupied. Lengths are in metres. --version prints the version; with --debug an
 error shows its traceback."""
 
 BENCH = "Run a study: print its table, draw its picture, and write its rows as JSON. Needs a checkout."
-TRAIN = "Train a prior on procedural tabletop objects, or on pictures of your own; resumes by itself after a stop."
 SUMMARIES = {
-    "replay": str(Replay.__doc__),
-    "live": str(Live.__doc__),
+    "replay": str(ReplayConfig.__doc__),
+    "live": str(LiveConfig.__doc__),
     "record": str(Record.__doc__),
     "query": str(Query.__doc__),
     "view": str(View.__doc__),
     "calibrate": str(Calibrate.__doc__).split("\n")[0],
     "capture": str(Capture.__doc__),
-    "train": TRAIN,
+    "train": str(Training.__doc__),
     "bench": BENCH,
 }
 
 
-def _configured(kind: type[Options], prog: str, args: Sequence[str], load: Callable[[], type]) -> Any:
-    """The configuration that `load` names, filled from a command's options and their --config file."""
-    options = tyro.cli(kind, args=args, prog=prog)  # first of all: a mistyped option answers at once
-    into = load()
-    names = [f.name for f in fields(kind) if f.name != "config"]  # type: ignore[arg-type]
-    config = into()
-    if (path := options.config) is not None:  # type: ignore[attr-defined]
+def _configured(kind: type[Config], prog: str, args: Sequence[str]) -> Config:
+    """A command's configuration: its options over the values of the file that --config names, over the defaults."""
+    finder = ArgumentParser(add_help=False, allow_abbrev=False)
+    finder.add_argument("--config", type=Path, nargs="?")
+    path = finder.parse_known_args(args)[0].config
+    config = kind()
+    if path is not None:
         from node.commands.config_file import load_config
 
-        config = load_config(path, into)  # its values become the defaults, and the options are read again
-        options = tyro.cli(kind, args=args, prog=prog, default=kind(**{n: getattr(config, n) for n in names}))
-    return replace(config, **{name: getattr(options, name) for name in names})
+        config = load_config(path, kind)
+    hidden = not {"--help", "-h"}.isdisjoint(args)
+    options = options_of(kind, hidden)
+    args = ["--help" if a == "--help-all" else a for a in args]
+    given = tyro.cli(options, args=args, prog=prog, default=options(**vars(config)))
+    return kind(**{f.name: getattr(given, f.name) for f in fields(kind)})  # type: ignore[arg-type]
 
 
 def _replay(args: Sequence[str]) -> int:
-    def load() -> type:
-        from node.commands.replay import ReplayConfig
-
-        return ReplayConfig
-
-    config = _configured(Replay, "farside replay", args, load)
+    config = _configured(ReplayConfig, "farside replay", args)
     from node.commands.replay import replay
 
     run = replay
@@ -69,12 +78,7 @@ def _replay(args: Sequence[str]) -> int:
 
 
 def _live(args: Sequence[str]) -> int:
-    def load() -> type:
-        from node.commands.options import LiveConfig
-
-        return LiveConfig
-
-    config = _configured(Live, "farside live", args, load)
+    config = _configured(LiveConfig, "farside live", args)
     from node.commands.live import live
 
     live(config, Console(), Console(stderr=True))
@@ -155,11 +159,9 @@ def _capture(args: Sequence[str]) -> int:
 
 
 def _train(args: Sequence[str]) -> int:
-    from node.commands.train import Training, train
+    options = tyro.cli(Training, args=args, prog="farside train")
+    from node.commands.train import train
 
-    options = tyro.cli(
-        Training, args=args, prog="farside train", description=TRAIN, config=(tyro.conf.OmitArgPrefixes,)
-    )
     return 0 if train(options, Console(), Console(stderr=True)) else 130
 
 

@@ -51,7 +51,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("training",),
     ),
     "perception": (("sources",), ("observation",), ("answers",), ("inference",), ("simulation",)),
-    "node": (("figures", "options"), ("ros", "viewer"), ("commands",), ("__main__",)),
+    "node": (("figures",), ("ros", "viewer"), ("commands",), ("__main__",)),
     "benchmarks": (
         ("harness",),
         ("scenes",),
@@ -93,12 +93,15 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     # recorded logs; messages on the bus
     "rosbags": ("perception/sources/recording.py", "perception/sources/recorder.py", "node/ros/messages.py"),
     "mcap": ("perception/sources/recording.py", "perception/sources/recorder.py"),
-    "yaml": ("calibration/camera_file.py", "node/commands/config_file.py"),  # camera files; launch files
+    "yaml": ("calibration/camera_file.py",),  # camera files, which ROS writes as YAML 1.1
+    # launch files: YAML 1.2 (1e-3 is a number), no key twice; then into dataclasses
+    "ruamel": ("node/commands/config_file.py",),
+    "pydantic": ("node/commands/config_file.py",),
     "zenoh": ("node/ros/bus.py",),
     "viser": ("node/viewer/page.py", "node/viewer/page_guard.py"),
     "websockets": ("node/viewer/page_guard.py",),  # viser's server
     "xxhash": ("node/ros/rmw_zenoh.py",),
-    "tyro": ("node/__main__.py", "node/options.py", "benchmarks/*", "examples/*"),
+    "tyro": ("node/__main__.py", "node/commands/options.py", "benchmarks/*", "examples/*"),
     "trimesh": ("perception/answers/regions.py", "benchmarks/scenes/meshes.py"),
     "rich": ("node/*", "benchmarks/*"),
     "PIL": ("node/figures/turning.py",),  # GIF

@@ -24,7 +24,7 @@ def test_installed_packages_are_those_that_exist() -> None:
 
 def names(requirements: list[str]) -> set[str]:
     """Normalised names of the distributions that requirement lines ask for."""
-    return {re.split(r"[^\w.-]", line)[0].lower().replace("_", "-") for line in requirements}
+    return {re.sub("[-_.]+", "-", re.split(r"[^\w.-]", line)[0].lower()) for line in requirements}
 
 
 def test_every_imported_library_is_declared() -> None:

@@ -15,8 +15,8 @@ from calibration.camera import Camera
 from calibration.camera_file import read_camera, write_camera
 from calibration.coverage import Coverage, coverage, next_views
 from calibration.print_board import Paper, write_target
+from node.commands.options import Calibrate
 from node.figures.calibration_figure import draw_calibration
-from node.options import Calibrate
 from perception.sources.open_source import open_source
 from perception.sources.pictures import Picture, open_pictures
 

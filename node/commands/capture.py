@@ -15,10 +15,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from calibration.boards import Board, parse_board
-from calibration.turntable import Turntable, TurntableConfig
+from calibration.turntable import Turntable
 from calibration.turntable_pose import PlateNotFoundError, PlatePose, locate_plate, plate_axis, turned
 from foundation.whole_file import write_whole
-from node.options import Capture
+from node.commands.options import Capture
 from perception.observation.turntable_views import (
     PlateMaskConfig,
     Square,
@@ -139,10 +139,7 @@ def capture(options: Capture, out: Console, err: Console) -> bool:
         raise ValueError(f"board {board} looks the same two ways round; give a charuco board")
     if options.source is None:
         raise ValueError("no --source was given; name the camera that sees the plate")
-    config = TurntableConfig(
-        axis=options.axis, degrees_per_unit=options.degrees_per_unit, speed=options.speed, baud=options.baud
-    )
-    table = Turntable(options.port, config)
+    table = Turntable(options.port, options.table)
     if options.background is not None and not options.background.is_file():
         raise FileNotFoundError(f"--background {options.background} does not exist; give a PNG of the empty plate")
     background = None if options.background is None else colour_to_rgb(read_png(options.background))

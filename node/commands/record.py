@@ -2,10 +2,9 @@
 
 from rich.console import Console
 
-from node.options import Record
+from node.commands.options import Record
 from perception.sources.playback import open_playback
 from perception.sources.recorder import Recorder
-from perception.sources.settings import RecordConfig
 from perception.sources.topic_names import TopicNames
 
 
@@ -19,8 +18,7 @@ def record(options: Record, out: Console, err: Console) -> None:
         raise ValueError(f"--seconds is {options.seconds:g}; give more than 0")
     topics = TopicNames(options.colour_topic, options.depth_topic)
     source = open_playback(options.source, 0.0, options.start_s, options.end_s, topics=topics)
-    config = RecordConfig(colour=options.colour, depth=options.depth, compression=options.compression)
-    recorder = Recorder(options.out, config, wait=not source.live)
+    recorder = Recorder(options.out, options.recording, wait=not source.live)
     first_ns = last_ns = None
     try:
         with recorder, err.status("recording; Ctrl-C ends it") as status:

@@ -4,7 +4,7 @@ import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -14,13 +14,14 @@ from rich.table import Table
 
 from calibration.camera import Camera
 from calibration.camera_file import read_camera
+from node.commands.options import ReplayConfig
 from node.figures.object_figure import draw_object
 from node.figures.summary import answer, diagnostics, figures, warnings
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.hypotheses_file import frame_path, hypotheses_path, load, save
 from perception.answers.summary import summarise
 from perception.inference.controller import Estimate, estimate
-from perception.inference.settings import ControllerConfig, TrackConfig
+from perception.inference.settings import ControllerConfig
 from perception.observation.segmentation import Segment, segment
 from perception.observation.settings import SegmentConfig
 from perception.sources.frame import Frame
@@ -30,63 +31,10 @@ from perception.sources.settings import SHIPPED_LOG
 from perception.sources.topic_names import TopicNames
 from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.sampling.hmc import StageInfo
-from probnerf.settings import Method
 from probnerf.types import StopReason
 
 BUDGET_S = 90.0
 PICTURE_S = 3.0  # of each object's share of the budget, kept back for its picture
-
-
-@dataclass(frozen=True)
-class ReplayConfig:
-    """Keys of a configuration file such as launch/replay.yaml; the command's options have the same names."""
-
-    source: Path | None = None  # frame folder or recording; None: the one that ships with the project
-    object: int | None = None  # the one object to infer; None: all
-    out: Path | None = None  # None: out/<name of the source>
-    budget: float | None = None  # s for the whole job; None: 90, or no limit where `stages` is given
-    stages: int | None = None  # of the sampler, per object
-    seed: int = 0
-    method: Method | None = None  # None: that of `controller.infer`
-    frame: int = 0  # of a recording (of its range); -1 is the last
-    start_s: float = 0.0  # of a recording: --from and --to, s after its first frame
-    end_s: float | None = None
-    schedule: bool = False  # repeat the inferences that the recording tells of
-    camera: Path | None = None  # calibration in place of the source's intrinsics
-    colour_topic: str | None = None  # of a recording; None: found by type and name
-    depth_topic: str | None = None  # of a recording; taken as aligned to colour
-    prior: Path | None = None  # None: the one that ships with the project
-    colour_only: bool = False  # leave depth out
-    box: tuple[int, int, int, int] | None = None  # px, of a frame without depth; wins over segment.mask
-    segment: SegmentConfig = field(default_factory=SegmentConfig)
-    controller: ControllerConfig = field(default_factory=ControllerConfig)
-    track: TrackConfig = field(default_factory=TrackConfig)  # of a schedule
-
-    def __post_init__(self) -> None:
-        if self.budget is not None and not self.budget > 0:
-            raise ValueError(f"the budget is {self.budget:g} s; give more than 0")
-        if self.stages is not None and self.stages < 1:
-            raise ValueError(f"stages is {self.stages}; give 1 or more")
-        if not 0 <= self.seed < 1 << 32:
-            raise ValueError(f"the seed is {self.seed}; give 0 to {(1 << 32) - 1}")
-
-    @property
-    def inference(self) -> ControllerConfig:
-        """The controller's configuration with the method that was asked for."""
-        if self.method is None:
-            return self.controller
-        return replace(self.controller, infer=replace(self.controller.infer, method=self.method))
-
-    @property
-    def topics(self) -> TopicNames:
-        """The recording's topics that were asked for."""
-        return TopicNames(self.colour_topic, self.depth_topic)
-
-    @property
-    def folder(self) -> Path:
-        """Where the results go."""
-        source = self.source or SHIPPED_LOG
-        return self.out or Path("out") / (source.stem if source.is_file() else source.resolve().name)
 
 
 def replay(config: ReplayConfig, out: Console, err: Console) -> bool:

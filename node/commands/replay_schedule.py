@@ -6,7 +6,8 @@ from pathlib import Path
 from rich.console import Console
 
 from calibration.camera_file import read_camera
-from node.commands.replay import ReplayConfig, progress_of, publish
+from node.commands.options import ReplayConfig
+from node.commands.replay import progress_of, publish
 from perception.inference.limits import Callbacks, Limits
 from perception.inference.schedule import config_hash, digest
 from perception.inference.tracker import Look, Tracker

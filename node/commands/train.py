@@ -3,9 +3,9 @@
 import json
 import subprocess
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -19,6 +19,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from node.commands.options import Training
 from node.figures.object_figure import draw_training
 from probnerf.likelihood.settings import Likelihood
 from probnerf.objects.tabletop import TRAIN_SEEDS
@@ -27,32 +28,8 @@ from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering import foam
 from probnerf.training import elbo as training
 from probnerf.training.pictures import ViewSet, draw_views
-from probnerf.training.settings import TrainConfig
 from probnerf.training.srn_dataset import read_views
 from probnerf.training.surface_samples import Solids, draw_solids
-
-
-@dataclass(frozen=True)
-class Training:
-    """What is trained, on what, and where it is kept."""
-
-    out: Path = Path("runs/tabletop")
-    """Folder of the run: checkpoint, history, curves.png and, in the end, prior.safetensors."""
-    preset: Literal["small", "paper", "tiny"] = "small"
-    """Sizes of the model: small for two CPU cores, the paper's, or tiny for a trial."""
-    start: Path | None = None
-    """Weights to go on from, of the same preset; give --frozen-steps with it. Random ones by default."""
-    objects: int = 40_000
-    """Training objects: the first seeds of the family."""
-    pictured: int = 4_000
-    """Of these, the first so many are also seen in pictures."""
-    data: Path | None = None
-    """Train on the posed pictures in this folder alone (SRN layout, as `farside capture` writes it), not on tabletop
-    objects. Every step is one of rays then: --solid-steps is 0, --learning-rate holds throughout, and --objects and
-    --pictured are not read."""
-    pictures: int | None = None
-    """Pictures of each of them; 8 by default, or all with --data."""
-    recipe: TrainConfig = field(default_factory=TrainConfig)
 
 
 def train(options: Training, out: Console, err: Console) -> bool:

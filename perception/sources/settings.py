@@ -10,21 +10,27 @@ SHIPPED_LOG = Path(__file__).parent / "shipped.mcap"
 
 @dataclass(frozen=True)
 class RecordConfig:
-    """How frames are encoded, and how much a killed recorder may lose.
+    """How frames are encoded, and how much a killed recorder may lose."""
 
-    Processor time and size of a frame of 640x480 with a sensor's noise, roughly, on a busy core: 12 ms and 1.2 MB raw
-    with lz4 (8 and 1.5 with none, 23 and 0.8 with zstd), 18 ms and 0.7 MB with PNG, 7 ms and 0.3 MB with JPEG; depth
-    as PNG would take longer than zstd for the same size. `farside bench record` measures it.
-    """
+    # Processor time and size of a frame of 640x480 with a sensor's noise, roughly, on a busy core: 12 ms and 1.2 MB raw
+    # with lz4 (8 and 1.5 with none, 23 and 0.8 with zstd), 18 ms and 0.7 MB with PNG, 7 ms and 0.3 MB with JPEG; depth
+    # as PNG would take longer than zstd for the same size. `farside bench record` measures it.
 
-    colour: Literal["raw", "png", "jpeg"] = "raw"  # of a JPEG the hypotheses differ from those made live
+    colour: Literal["raw", "png", "jpeg"] = "raw"
+    """raw costs the least time, png (exact) more time and less space, jpeg the least space. JPEG is not exact: its
+    hypotheses differ from those made live."""
     jpeg_quality: int = 95
-    # exact: 16UC1 where the depth is whole millimetres, else 32FC1; millimetres: always 16UC1, 0 beyond 65 m
+    """1 to 100."""
     depth: Literal["exact", "millimetres"] = "exact"
-    compression: Literal["none", "lz4", "zstd"] = "lz4"  # of the chunks
-    chunk_bytes: int = 8 << 20  # before compression
+    """exact: 16UC1 where depth is whole millimetres, else 32FC1. millimetres: rounded, always 16UC1, 0 beyond 65 m."""
+    compression: Literal["none", "lz4", "zstd"] = "lz4"
+    """Of the file: from the least time to the least space."""
+    chunk_bytes: int = 8 << 20
+    """Size of the file's chunks before compression."""
     flush_s: float = 0.5
-    waiting: int = 60  # frames and messages that may wait for the writer: two seconds of a camera
+    """Seconds after which a chunk is written though it is not full; a killed recorder loses no more."""
+    waiting: int = 60
+    """Frames and messages that may wait for the writer; two seconds of a camera."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.jpeg_quality <= 100:

@@ -2,6 +2,8 @@
 
 import json
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -95,10 +97,10 @@ def test_options_win_over_the_file_and_reach_the_sampler(
         f"source: {folder}\nprior: {prior}\nseed: 5\nstages: 3\nout: {tmp_path / 'out'}\nobject: 2\n"
         "method: annealed_hmc\ncontroller: {hypotheses: 9}\n"
     )
-    assert main(["replay", "--config", str(config), "--stages", "4"]) == 0
+    assert main(["replay", "--config", str(config), "--stages", "4", "--controller.runs", "2"]) == 0
     (call,) = asked.calls
     assert (call["id"], call["seed"], call["stages"], call["budget_s"]) == (2, 5, 4, None)
-    assert call["config"].hypotheses == 9 and call["config"].infer.method == "annealed_hmc"
+    assert (call["config"].hypotheses, call["config"].runs, call["config"].infer.method) == (9, 2, "annealed_hmc")
     assert load(tmp_path / "out" / "object_2.npz").seed == 5
 
 
@@ -310,6 +312,35 @@ def test_help_reads_well(capsys: pytest.CaptureFixture, command: list[str]) -> N
         with pytest.raises(SystemExit):
             main([])
         assert capsys.readouterr().out == text
+
+
+@pytest.mark.parametrize("command", ["replay", "live"])
+def test_nested_settings_are_listed_on_request_alone(capsys: pytest.CaptureFixture, command: str) -> None:
+    text = {}
+    for option in ("--help", "--help-all"):
+        with pytest.raises(SystemExit) as ended:
+            main([command, option])
+        assert ended.value.code == 0
+        text[option] = capsys.readouterr().out
+    assert "--controller" not in text["--help"] and "--help-all" in text["--help"]
+    assert "--controller.tolerance" in text["--help-all"] and "--seed" in text["--help-all"]
+
+
+def test_help_and_mistyped_options_load_nothing_heavy() -> None:
+    """Neither JAX, nor OpenCV, nor NumPy: they answer at once."""
+    code = """
+import sys
+from node.__main__ import COMMANDS, main
+for command in COMMANDS:
+    for option in ("--help", "--mistyped"):
+        try:
+            command == "bench" or main([command, option])
+        except SystemExit:
+            pass
+assert not {"jax", "cv2", "numpy"} & set(sys.modules), sorted(sys.modules)
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
 
 
 def _any_hypotheses(frame: Frame):

@@ -17,8 +17,8 @@ from calibration.camera_file import read_camera, write_camera
 from calibration.coverage import coverage
 from node.__main__ import main
 from node.commands.calibrate import find_views
+from node.commands.options import Calibrate
 from node.figures.calibration_figure import draw_calibration
-from node.options import Calibrate
 from perception.sources.frame import Frame
 from perception.sources.oak import camera_of_device_json
 from perception.sources.open_source import open_source

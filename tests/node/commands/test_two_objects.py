@@ -12,7 +12,7 @@ import pytest
 import perception.inference.tracker
 from node.__main__ import main
 from node.commands.config_file import load_config
-from node.commands.replay import ReplayConfig
+from node.commands.options import ReplayConfig
 from perception.answers.hypotheses_file import load, save
 from perception.answers.query import query
 from perception.answers.regions import Box
