@@ -64,7 +64,7 @@ def _configured(kind: type[Config], prog: str, args: Sequence[str]) -> Config:
     options = options_of(kind, hidden)
     args = ["--help" if a == "--help-all" else a for a in args]
     given = tyro.cli(options, args=args, prog=prog, default=options(**vars(config)))
-    return kind(**{f.name: getattr(given, f.name) for f in fields(kind)})  # type: ignore[arg-type]
+    return kind(**{f.name: getattr(given, f.name) for f in fields(kind)})
 
 
 def _replay(args: Sequence[str]) -> int:

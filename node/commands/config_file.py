@@ -58,11 +58,16 @@ def from_mapping(into: type[T], values: object) -> T:
         made = {f.name: f.default_factory() for f in fields(into) if f.default_factory is not MISSING}  # type: ignore[arg-type]
         values = {key: _over(made.get(key), value) for key, value in values.items()}
     # JSON has lists and texts where dataclasses have tuples and paths; strict reading of it converts nothing else.
-    text = json.dumps(values, default=lambda value: asdict(value) if is_dataclass(value) else str(value))
+    text = json.dumps(values, default=_plain)
     try:
         return TypeAdapter(into).validate_json(text, strict=True, extra="forbid")
     except ValidationError as errors:
         raise ValueError(_complaint(into, errors)) from None
+
+
+def _plain(value: Any) -> Any:
+    """What JSON has no notation for: dataclasses, and paths and dates, as texts."""
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else str(value)
 
 
 def _over(default: object, values: object) -> object:

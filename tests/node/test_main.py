@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -312,35 +310,6 @@ def test_help_reads_well(capsys: pytest.CaptureFixture, command: list[str]) -> N
         with pytest.raises(SystemExit):
             main([])
         assert capsys.readouterr().out == text
-
-
-@pytest.mark.parametrize("command", ["replay", "live"])
-def test_nested_settings_are_listed_on_request_alone(capsys: pytest.CaptureFixture, command: str) -> None:
-    text = {}
-    for option in ("--help", "--help-all"):
-        with pytest.raises(SystemExit) as ended:
-            main([command, option])
-        assert ended.value.code == 0
-        text[option] = capsys.readouterr().out
-    assert "--controller" not in text["--help"] and "--help-all" in text["--help"]
-    assert "--controller.tolerance" in text["--help-all"] and "--seed" in text["--help-all"]
-
-
-def test_help_and_mistyped_options_load_nothing_heavy() -> None:
-    """Neither JAX, nor OpenCV, nor NumPy: they answer at once."""
-    code = """
-import sys
-from node.__main__ import COMMANDS, main
-for command in COMMANDS:
-    for option in ("--help", "--mistyped"):
-        try:
-            command == "bench" or main([command, option])
-        except SystemExit:
-            pass
-assert not {"jax", "cv2", "numpy"} & set(sys.modules), sorted(sys.modules)
-"""
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert ended.returncode == 0, ended.stderr
 
 
 def _any_hypotheses(frame: Frame):

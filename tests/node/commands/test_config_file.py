@@ -1,14 +1,13 @@
 """YAML becomes the dataclasses exactly, and whatever does not fit is named."""
 
-import json
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import pytest
 
 from node.commands.config_file import from_mapping, load_config
-from node.commands.options import LiveConfig, ReplayConfig, options_of
+from node.commands.options import LiveConfig, ReplayConfig
 
 LAUNCH = Path(__file__).resolve().parents[3] / "launch"
 
@@ -107,14 +106,3 @@ def test_the_launch_file_states_the_defaults() -> None:
     assert loaded.budget == 90.0 and loaded != ReplayConfig()
     assert replace(loaded, budget=None, controller=ReplayConfig().controller) == ReplayConfig()
     assert loaded.controller == ReplayConfig().controller
-
-
-@pytest.mark.parametrize("kind", [ReplayConfig, LiveConfig])
-def test_options_and_keys_are_fields_of_one_dataclass(kind: type) -> None:
-    """What a file may hold is what the command line reads, but for --config; and the whole of it comes back."""
-    options = {f.name for f in fields(options_of(kind, hidden=False))}
-    assert options == {f.name for f in fields(kind)} | {"config"}
-    everything = json.loads(json.dumps(asdict(kind()), default=str))
-    assert from_mapping(kind, everything) == kind()
-    with pytest.raises(ValueError, match="unknown key config"):
-        from_mapping(kind, {"config": "other.yaml"})
