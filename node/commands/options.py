@@ -6,7 +6,7 @@ modules that import neither JAX nor OpenCV are imported here, so that help and m
 
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.conf import Positional, arg
@@ -324,7 +324,8 @@ class Training:
 
 def options_of(kind: type, hidden: bool) -> type:
     """`kind` as the command line reads it: with --config, and unchecked. `hidden` leaves its nested settings out."""
-    nested = [(f.name, tyro.conf.Suppress[f.type], None) for f in fields(kind) if hidden and is_dataclass(f.type)]
+    suppress: Any = tyro.conf.Suppress
+    nested = [(f.name, suppress[f.type], None) for f in fields(kind) if hidden and is_dataclass(f.type)]
     hint = "(default: none)"
     text = (
         "YAML file with these options and all others by name, such as launch/replay.yaml or launch/live.yaml; options"
