@@ -243,8 +243,10 @@ def tempered_smc(
                 break
             now = time.monotonic()
             stage_key = jax.random.fold_in(key, record.stages)
-            made = _stage(stage_key, record.state, args, reference, log_likelihood=log_likelihood, config=config)
-            record.add(*made, now)
+            state, stats, pool = _stage(
+                stage_key, record.state, args, reference, log_likelihood=log_likelihood, config=config
+            )
+            record.add(state, stats, pool, now)
     except KeyboardInterrupt:
         result = StopReason.INTERRUPTED
     return record.posterior(result)
