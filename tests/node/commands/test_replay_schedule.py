@@ -231,12 +231,8 @@ def test_record_on_a_full_disk_keeps_what_was_written(tmp_path: Path, capsys: py
     with Recorder(source, wait=True) as recorder:
         for i in range(100):
             recorder.write_frame(small_frame(i))
-    with no_file_beyond(source.stat().st_size // 2), pytest.MonkeyPatch.context() as patch:
-        import node.commands.record
-        from perception.sources.settings import RecordConfig
-
-        patch.setattr(node.commands.record, "RecordConfig", lambda **given: RecordConfig(**given, chunk_bytes=1))
-        assert main(["record", str(source), "--out", str(out)]) == 1
+    with no_file_beyond(source.stat().st_size // 2):
+        assert main(["record", str(source), "--out", str(out), "--chunk-bytes", "1"]) == 1
     assert "out.mcap: recording ended at frame" in one_line(capsys.readouterr().err)
     assert len(list(Log(out))) > 10
 
@@ -253,7 +249,7 @@ class Camera:
             if i == 5:
                 print("ready", flush=True)
             yield frame(i)
-node.commands.record.open_playback = lambda *_: Camera()
+node.commands.record.open_playback = lambda *_, **__: Camera()
 from node.__main__ import main
 sys.exit(main(["record", "camera", "--out", sys.argv[1]]))
 """
