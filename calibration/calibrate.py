@@ -105,7 +105,7 @@ def calibrate(
     by one, the worst first, though never more than half. Standard deviations are those of least squares at the
     solution, for independent noise of the corners as large as the residuals. What makes the result unusable stands in
     `trouble`.
-    Raises ValueError where the views are too few or no camera fits at all.
+    Raises ValueError if the views are too few or no camera fits at all.
     """
     config = config or CalibrateConfig()
     if len(views) < config.fewest_views:

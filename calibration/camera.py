@@ -19,7 +19,7 @@ class Camera:
 
     Models have their ROS names. `equidistant` is OpenCV's fisheye (Kannala and Brandt 2006): a ray at the angle theta
     from the axis falls at the radius theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8), in focal lengths.
-    Raises `ValueError` where a field cannot be a camera's.
+    Raises `ValueError` if a field cannot be a camera's.
     """
 
     width: int  # px

@@ -99,7 +99,7 @@ def plate_axis(T_plate_cameras: Float[np.ndarray, "n 4 4"]) -> tuple[Float[np.nd
     """Where the plate's axis meets it (x, y in the plate frame, m), and the rms by which cameras leave their circle.
 
     The camera stands still, so that in the plate frame its places lie on a circle round the axis. Raises ValueError
-    where they do not tell one: fewer than three, or all close together.
+    if they do not tell one: fewer than three, or all close together.
     """
     places = np.asarray(T_plate_cameras, np.float64)[:, :2, 3]
     centred = places - places.mean(axis=0)

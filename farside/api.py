@@ -67,9 +67,10 @@ Objects = Sequence[Hypotheses] | Hypotheses
 
 
 def read_frame(source: str | Path | None = None, index: int = 0, camera: Camera | None = None) -> Frame:
-    """Frame `index` (-1: the last) of a frame folder or a recording; None is the recording that ships with Farside.
+    """Frame `index` (-1: the last) of a frame folder or a recording. Without a source: the recording that ships with
+    Farside.
 
-    `camera` takes the place of the source's own calibration. Raises `FileNotFoundError` or `ValueError`.
+    `camera` replaces the source's own calibration. Raises `FileNotFoundError` or `ValueError`.
     """
     return frame_at(source, index, camera=camera)[0]
 
@@ -85,12 +86,13 @@ def estimate(
     stages: int | None = None,
     on_progress: Callable[[int, StageInfo], bool | None] | None = None,
 ) -> Scene:
-    """Infer the objects of a frame: all that `farside.segment` finds, or `segments` of them.
+    """Infer the objects of a frame: all that `farside.segment` finds, or only `segments`.
 
-    `budget_s` is shared by the objects (None: until all have converged). `stages` is the most that the sampler makes
-    for each object; without a budget the answer is a function of the arguments alone. `on_progress` is called with the
-    object's id and the sampler's state after every stage; if it returns True the answer is given as it stands. An
-    object that cannot be inferred is named in `Scene.left_out`; where there is no other, its `ValueError` is raised.
+    `budget_s` is shared by the objects (None: no limit, each runs until it has converged). `stages` limits the
+    sampler's stages for each object. Without a budget the answer depends on the arguments alone. `on_progress` is
+    called after every stage with the object's id and the sampler's state. If it returns True, inference ends, and the
+    present answer is returned. An object that cannot be inferred is named in `Scene.left_out`; if no object can be, its
+    `ValueError` is raised.
     """
     begun = time.monotonic()
     if segments is None:
@@ -115,24 +117,24 @@ def estimate(
 def query(scene: Objects, region: Region, frame: FrameName = "camera", now_ns: int | None = None) -> QueryResult:
     """How likely a region (metres, in `frame`) is free, jointly over all hypotheses and objects.
 
-    Frames: "camera" (x right, y down, z forward), "object" (of a single object: z up, x towards the camera), "world"
-    where the camera's pose is known. `now_ns` is the time to which the answer's age is counted (None: now). Raises
+    Frames: "camera" (x right, y down, z forward), "object" (of a single object: z up, x towards the camera), "world" if
+    the camera's pose is known. `now_ns` is the time at which the answer's age is taken (None: now). Raises
     `ValueError`.
     """
     return ask(_objects(scene), region, frame, now_ns)
 
 
 def next_views(scene: Objects, cameras: Float[np.ndarray, "c 4 4"] | None = None, count: int = 5) -> RankedViews:
-    """The `count` camera poses that are expected to tell most, best first.
+    """The `count` camera poses with the largest expected information gain, best first.
 
-    `cameras` to choose from are T_object_camera in the first object's frame, metres (None: a ring about it). Raises
+    `cameras` are the candidates, T_object_camera in the first object's frame, metres (None: a ring around it). Raises
     `ValueError`.
     """
     return rank_views(_objects(scene), cameras, count)
 
 
 def save(folder: str | Path, scene: Objects, frame: Frame | None = None) -> list[Path]:
-    """Write object_<id>.npz for each object, and the frame beside them; what `farside view` and `load` read.
+    """Write object_<id>.npz for each object, and the frame beside them. `farside view` and `load` read these files.
 
     Raises `OSError` that names the file. A file is written whole or not at all.
     """
@@ -145,7 +147,7 @@ def save(folder: str | Path, scene: Objects, frame: Frame | None = None) -> list
 
 
 def load(path: str | Path) -> Scene:
-    """A hypotheses file, or all those of a folder. Raises `OSError` or `ValueError` that names it."""
+    """Read a hypotheses file, or all of a folder. Raises `OSError` or `ValueError` that names it."""
     return Scene(tuple(load_scene(path)))
 
 

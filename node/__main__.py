@@ -1,4 +1,4 @@
-"""The command `farside`: options in, one clear line out where something is wrong with them.
+"""The command `farside`: parses options, runs a command, and prints an error as one line.
 
 A command's code is imported when it runs, so that help and mistyped options answer at once.
 """
@@ -96,7 +96,7 @@ def _record(args: Sequence[str]) -> int:
 def _query(args: Sequence[str]) -> int:
     options = tyro.cli(Query, args=args, prog="farside query")
     box, points, mesh = options.box, options.points, options.mesh
-    if sum(given is not None for given in (box, points, mesh)) != 1:
+    if sum(option is not None for option in (box, points, mesh)) != 1:
         raise ValueError("a query needs one of --box X0 Y0 Z0 X1 Y1 Z1, --points FILE.xyz and --mesh FILE.obj")
     from node.figures.query_answer import answer
     from perception.answers.hypotheses_file import load_scene
@@ -138,7 +138,7 @@ def _view(args: Sequence[str]) -> int:
 
 def _calibrate(args: Sequence[str]) -> int:
     options = tyro.cli(Calibrate, args=args, prog="farside calibrate")
-    if sum(given is not None for given in (options.source, options.from_, options.print_target)) != 1:
+    if sum(option is not None for option in (options.source, options.from_, options.print_target)) != 1:
         raise ValueError("give one of SOURCE (pictures of a board), --from SOURCE and --print-target FILE.pdf")
     from node.commands.calibrate import calibrate_camera, copy_camera, print_target
 
@@ -200,8 +200,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv is None:
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # a service's stop is a Ctrl-C
         _end(main(sys.argv[1:]))
-    given = list(argv)
-    args = [a for a in given if a != "--debug"]
+    arguments = list(argv)
+    args = [a for a in arguments if a != "--debug"]
     prepare()
     if args == ["--version"]:
         print(f"farside {version('farside')}")
@@ -215,29 +215,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return COMMANDS[args[0]](args[1:])
     except (ValueError, OSError, FloatingPointError) as error:
-        if "--debug" in given:
+        if "--debug" in arguments:
             raise
-        said = str(error)
-        if isinstance(error, OSError) and error.filename is not None and said.startswith("[Errno"):
-            said = f"{error.filename}: {error.strerror}; check this path, and that it may be read or written"
-        print(f"farside: error: {' '.join(said.split())}", file=sys.stderr)
+        message = str(error)
+        if isinstance(error, OSError) and error.filename is not None and message.startswith("[Errno"):
+            message = f"{error.filename}: {error.strerror}; check this path, and that it may be read or written"
+        print(f"farside: error: {' '.join(message.split())}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as error:
-        if "--debug" in given:
+        if "--debug" in arguments:
             raise
         print("farside: interrupted", file=sys.stderr)
         _UNFINISHED.append(error)
         return 130
 
 
-# A Ctrl-C while jaxlib compiles leaves objects in its frames whose end may crash the process; they are not ended.
+# A Ctrl-C while jaxlib compiles leaves objects in its frames whose destruction may crash the process. Keep them.
 _UNFINISHED: list[KeyboardInterrupt] = []
 
 
 def _end(code: int) -> NoReturn:
-    """End the process at once: after a Ctrl-C while it compiled, jaxlib crashes in the interpreter's own way to end."""
+    """End the process at once. After a Ctrl-C during compilation, jaxlib crashes in the interpreter's shutdown."""
     for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError):  # nobody reads it any more
+        with suppress(OSError):  # the reader is gone
             stream.flush()
     os._exit(code)
 

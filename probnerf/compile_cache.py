@@ -88,33 +88,33 @@ class Program:
         """As the function."""
         if _folder() is None:
             return self.jitted(*args, **kwargs)
-        given = self._signature.bind(*args, **kwargs).arguments
-        static = {name: given.pop(name) for name in self._static if name in given}
-        leaves, tree = jax.tree.flatten(given)
+        arguments = self._signature.bind(*args, **kwargs).arguments
+        static = {name: arguments.pop(name) for name in self._static if name in arguments}
+        leaves, tree = jax.tree.flatten(arguments)
         if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return self.jitted(*args, **kwargs)
         key = (tree, tuple(map(_kind, leaves)), tuple(static.items()))
         if key not in self._ready:
             with _LOCK:
                 if key not in self._ready:
-                    self._ready[key] = self._found(given, static, key)
+                    self._ready[key] = self._found(arguments, static, key)
         run = self._ready[key]
         if self._rehearse and _REHEARSING.get() and isinstance(run, jax.stages.Compiled):
             return jax.tree.map(lambda a: jax.device_put(np.zeros(a.shape, a.dtype), a.sharding), run.out_info)
-        return run(**given)
+        return run(**arguments)
 
-    def _found(self, given: dict[str, Any], static: dict[str, Any], key: tuple) -> Callable[..., Any]:
+    def _found(self, arguments: dict[str, Any], static: dict[str, Any], key: tuple) -> Callable[..., Any]:
         """The program for these arguments: from its file, or compiled and kept there."""
-        said = " ".join((*self._name, str(key[0]), str(key[1]), _told(static)))
+        content = " ".join((*self._name, str(key[0]), str(key[1]), _told(static)))
         folder = _folder()
-        if " at 0x" in said or folder is None:  # an object whose name does not say what it is
-            return lambda **given: self.jitted(**given, **static)
-        path = folder / f"{self._name[1]}-{hashlib.sha256(said.encode()).hexdigest()[:32]}"
+        if " at 0x" in content or folder is None:  # an object whose name does not say what it is
+            return lambda **arguments: self.jitted(**arguments, **static)
+        path = folder / f"{self._name[1]}-{hashlib.sha256(content.encode()).hexdigest()[:32]}"
         try:
-            return _read(path, given)
+            return _read(path, arguments)
         except Exception:  # not there, cut short, or of a library that reads it otherwise: made, and written over
             pass
-        compiled = _compiled(self.jitted.lower(**given, **static))
+        compiled = _compiled(self.jitted.lower(**arguments, **static))
         _write(path, compiled)
         return compiled
 
@@ -155,12 +155,12 @@ def _write(path: Path, compiled: jax.stages.Compiled) -> None:
         write_whole(path, pickle.dumps((code, sorted(devices), answer)))
 
 
-def _read(path: Path, given: dict[str, Any]) -> Callable[..., Any]:
+def _read(path: Path, arguments: dict[str, Any]) -> Callable[..., Any]:
     _with_lapack()
     code, devices, answer = pickle.loads(path.read_bytes())
     return serialize_executable.deserialize_and_load(
         code,
-        jax.tree.structure(((), given)),
+        jax.tree.structure(((), arguments)),
         jax.tree.structure(answer),
         execution_devices=[d for d in jax.devices() if d.id in devices],
     )
@@ -202,12 +202,12 @@ def _environment() -> str:
     switches = sorted((k, v) for k, v in os.environ.items() if k.startswith(("XLA_", "FARSIDE_KERNEL")))
     libraries = [version(name) for name in ("jax", "jaxlib", "equinox", "optax", "numpy")]
     machine = [platform.machine(), _processor(), os.cpu_count(), str(jax.devices()), library.available()]
-    told = repr((source.hexdigest(), settings, switches, libraries, sys.version, machine))
-    return hashlib.sha256(told.encode()).hexdigest()[:16]
+    content = repr((source.hexdigest(), settings, switches, libraries, sys.version, machine))
+    return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
 def _processor() -> str:
     """What instructions the processor knows, or its name."""
-    told = Path("/proc/cpuinfo")
-    lines = told.read_text().splitlines() if told.is_file() else []
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
     return next((line for line in lines if line.startswith(("flags", "Features"))), platform.processor())

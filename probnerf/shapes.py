@@ -23,16 +23,16 @@ def opacity_grids(
     likelihood: Likelihood,
     positions: Float[Array, "s d"],
     pose_sigma: Float[Array, "5"],
-    asked: Bool[Array, "g g g"],
+    wanted: Bool[Array, "g g g"],
 ) -> UInt8[Array, "s g g g"]:
-    """round(255 x opacity across a voxel) of each position's shape on [-1, 1]^3 of the view frame, 0 if not `asked`.
+    """round(255 x opacity across a voxel) of each position's shape on [-1, 1]^3 of the view frame, 0 if not `wanted`.
 
     A voxel's opacity is the largest at its eight corners: like the truth's, it is a wall where it meets the solid.
     """
-    grid = asked.shape[0]
+    grid = wanted.shape[0]
     axis = jnp.linspace(-1.0, 1.0, grid + 1)
     points = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-    corners = jax.lax.reduce_window(jnp.pad(asked, 1), False, jnp.logical_or, (2, 2, 2), (1, 1, 1), "valid")
+    corners = jax.lax.reduce_window(jnp.pad(wanted, 1), False, jnp.logical_or, (2, 2, 2), (1, 1, 1), "valid")
     points = jnp.where(corners[..., None], points, _NOWHERE).reshape(-1, 3)
     decoded = jax.vmap(model.decode)(positions[:, : model.latent])  # together, as in `plain_log_likelihood`
 
@@ -44,7 +44,7 @@ def opacity_grids(
         corner = jnp.round(-255.0 * jnp.expm1(-sigma * scale / grid)).astype(jnp.uint8)
         corner = corner.reshape(grid + 1, grid + 1, grid + 1)
         largest = jax.lax.reduce_window(corner, jnp.uint8(0), jax.lax.max, (2, 2, 2), (1, 1, 1), "valid")
-        return jnp.where(asked, largest, 0)
+        return jnp.where(wanted, largest, 0)
 
     return jax.lax.map(one, (positions, decoded))
 

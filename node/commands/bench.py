@@ -11,7 +11,7 @@ CHECKOUT = Path(node.__file__).resolve().parent.parent
 
 
 def bench(args: Sequence[str]) -> int:
-    """Run the studies' command with these arguments and return its exit code; it raises what a study raises.
+    """Run the studies' command with these arguments and return its exit code. Errors of a study are raised.
 
     Raises FileNotFoundError outside a checkout.
     """

@@ -82,7 +82,7 @@ def find_views(
 ) -> Found:
     """Views of the board. Of a stream (`total` is None) those that differ, told as they come, and the next to take.
 
-    Ctrl-C ends the search, as does a camera that is lost, and what was found counts. Raises ValueError where pictures
+    Ctrl-C ends the search, as does a camera that is lost, and what was found counts. Raises ValueError if pictures
     differ in size, or none shows the board.
     """
     source, found, first = options.source, Found(), ""

@@ -1,4 +1,4 @@
-"""Capturing an object on a turntable: turn, wait, take a posed view, write it; whatever was taken is kept."""
+"""Capturing an object on a turntable: turn, wait, take a posed view, write it. Views survive a stop."""
 
 import json
 import re
@@ -57,8 +57,8 @@ class Session:
 
     def save(self) -> None:
         """Write the file as a whole, or not at all."""
-        said = {key: value for key, value in vars(self).items() if key != "folder"}
-        write_whole(self.path, json.dumps(said, indent=1) + "\n")
+        content = {key: value for key, value in vars(self).items() if key != "folder"}
+        write_whole(self.path, json.dumps(content, indent=1) + "\n")
 
     def missing(self) -> list[int]:
         """Views that are not there yet, in order."""
@@ -75,7 +75,7 @@ class Session:
 
 
 def open_session(options: Capture) -> Session:
-    """A fresh folder, or the one of a capture that was stopped. Raises ValueError where it holds something else."""
+    """A fresh folder, or the one of a capture that was stopped. Raises ValueError if it holds something else."""
     if options.views < 1:
         raise ValueError(f"--views is {options.views}; give 1 or more")
     if not re.fullmatch(r"[\w-][\w.-]*", options.instance):
@@ -86,8 +86,8 @@ def open_session(options: Capture) -> Session:
             raise ValueError(f"{session.folder} holds files that are no capture's; give another --instance or --out")
         return session
     try:
-        said = json.loads(session.path.read_text(encoding="utf-8"))
-        found = Session(session.folder, **said)
+        content = json.loads(session.path.read_text(encoding="utf-8"))
+        found = Session(session.folder, **content)
     except (json.JSONDecodeError, UnicodeDecodeError, TypeError) as error:
         raise ValueError(f"{session.path} is damaged ({error}); delete {session.folder} and capture again") from None
     for name in ("board", "views"):
@@ -270,13 +270,13 @@ def _finish(session: Session, board: Board, garbage: int, skipped: list[int], ou
 
 
 def _steps(session: Session, T: Float[np.ndarray, "v 4 4"]) -> str:
-    """How far the board says that the plate turned from view to view, against what was asked for."""
+    """How far the plate turned from view to view by the board, compared with the commanded turns."""
     have = [i for i in range(session.views) if i not in session.missing()]
-    asked = np.array([360.0 * (b - a) / session.views for a, b in pairwise(have)])
+    turns = np.array([360.0 * (b - a) / session.views for a, b in pairwise(have)])
     seen = np.array([turned(a, b) for a, b in pairwise(T)])
-    if not len(asked):
+    if not len(turns):
         return "one view"
-    forward, backward = (np.abs((seen - sign * asked + 180.0) % 360.0 - 180.0) for sign in (1, -1))
+    forward, backward = (np.abs((seen - sign * turns + 180.0) % 360.0 - 180.0) for sign in (1, -1))
     off = min(forward, backward, key=np.median)
     sense = "clockwise" if off is backward else "counter-clockwise"
-    return f"{sense} from above, at most {off.max():.1f} degrees off what was asked for"
+    return f"{sense} from above, at most {off.max():.1f} degrees from the commanded turns"

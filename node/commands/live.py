@@ -46,9 +46,9 @@ KEPT = 1000  # stamps of recorded frames that are remembered
 def live(config: LiveConfig, out: Console, err: Console) -> None:
     """Run the node until Ctrl-C, `config.seconds`, or the source's end.
 
-    Raises OSError, ValueError or FileNotFoundError in one line for a source that is not there, an endpoint or port in
-    use, or a file that cannot be written; at the end, too, where the recording had broken off. What goes wrong with one
-    frame is said once and counted.
+    Raises OSError, ValueError or FileNotFoundError in one line for a missing source, an endpoint or port in use, or a
+    file that cannot be written; at the end also if the recording broke off. A fault of one frame is reported once and
+    counted.
     """
     tracker = Tracker(load_prior(config.prior), config.controller, config.track, config.seed)
     with ExitStack() as stack:
@@ -59,7 +59,7 @@ def live(config: LiveConfig, out: Console, err: Console) -> None:
             from node.viewer.page import Page  # viser takes a second to import
 
             page = stack.enter_context(Page(config.page, config.token))
-        recorder = None  # after all that may fail: a run that did not begin leaves no file
+        recorder = None  # last, after all that may fail: a failed start leaves no file
         if config.record is not None:
             recorder = Recorder(config.record, config.recording)
             stack.callback(_close, recorder)
@@ -139,7 +139,7 @@ class _Keeper:
         while True:
             try:
                 frame = self._listener.take(0.5)
-            except Exception:  # the source's end is the main thread's to tell
+            except Exception:  # the main thread reports the source's end
                 return
             if frame is None:
                 if self._listener.ended:

@@ -1,4 +1,4 @@
-"""`farside record`: frames of a source into a file, and a line that tells how it goes."""
+"""`farside record`: frames of a source into a file, with a progress line."""
 
 from rich.console import Console
 
@@ -11,8 +11,8 @@ from perception.sources.topic_names import TopicNames
 def record(options: Record, out: Console, err: Console) -> None:
     """Record until the source ends, the time is over or Ctrl-C, and print what was recorded.
 
-    Frames of a live source that come faster than they can be written are dropped, and counted; a recording's are not.
-    Raises OSError where writing fails (what was written stays), ValueError where the source gave no frame.
+    Frames of a live source that come too fast to be written are dropped and counted; a recording's frames are not.
+    Raises OSError if writing fails (the written part stays), ValueError if the source gave no frame.
     """
     if options.seconds is not None and not options.seconds > 0:
         raise ValueError(f"--seconds is {options.seconds:g}; give more than 0")

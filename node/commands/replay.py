@@ -1,4 +1,4 @@
-"""The main job: a source's frame, the objects in it, and for each one hypotheses, a short table and a picture."""
+"""`farside replay`: from a source's frame to each object's hypotheses, answer and picture."""
 
 import re
 import time
@@ -38,10 +38,10 @@ PICTURE_S = 3.0  # of each object's share of the budget, kept back for its pictu
 
 
 def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
-    """Infer, save, picture and print the objects of one frame. False if Ctrl-C ended it; what is saved is whole.
+    """Infer, save, picture and print the objects of one frame. False if Ctrl-C ended it; saved files are whole.
 
-    An object that cannot be inferred is passed over with a note, unless it is the only one that was asked for. Raises
-    `ValueError` or `FileNotFoundError` in one line, before anything is written, for whatever the user can mend.
+    An object that cannot be inferred is skipped with a note, unless it is the only one. Raises `ValueError` or
+    `FileNotFoundError` in one line, before anything is written, for errors of the input.
     """
     begun = time.monotonic()
     if config.folder.exists() and not config.folder.is_dir():
@@ -73,7 +73,7 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
             complaint = ValueError(f"{source}: {error}")
             continue
         if not done and not is_source:
-            (kept / "meta.json").unlink(missing_ok=True)  # an earlier run's frame is not read beside this one's objects
+            (kept / "meta.json").unlink(missing_ok=True)  # an older frame must not stay beside new objects
         path = publish(config.folder, frame, found, result.hypotheses, result.seconds, out, result.log)
         if not done:
             _clear_others(config.folder, path, result.hypotheses if config.object is not None else None, out)
@@ -88,7 +88,9 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
 
 
 def _segmentation(frame: Frame, config: ReplayConfig) -> SegmentConfig:
-    """How objects are found, with the box that was drawn. Raises `ValueError` where depth makes it idle."""
+    """How objects are found, with the user's box. Raises `ValueError` if the frame has depth, which makes a box
+    useless.
+    """
     if config.box is None:
         return config.segment
     if frame.depth is not None:
@@ -105,9 +107,9 @@ def read_frame(
     camera: Camera | None = None,
     topics: TopicNames | None = None,
 ) -> Frame:
-    """Frame `index` (-1: the last) of a source, or of a recording's range, with `camera` and `topics` for its own.
+    """Frame `index` (-1: the last) of a source, or of a recording's range. `camera` and `topics` replace its own.
 
-    Its notes go to `err`. Raises ValueError where there is none.
+    Its notes go to `err`. Raises ValueError if there is no such frame.
     """
     frame, notes = frame_at(source, index, start_s, end_s, camera, topics)
     for note in notes:
@@ -134,7 +136,7 @@ def infer(
 def progress_of(
     name: str, stages: int | None, budget: float | None, err: Console
 ) -> Iterator[Callable[[StageInfo], None]]:
-    """A line that tells the stage, how far the tempering is, and how the sampler moves."""
+    """A progress line: the stage, the temperature, and the sampler's acceptance."""
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=24), TimeElapsedColumn())
     begun = time.monotonic()
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as progress:
@@ -174,8 +176,8 @@ def publish(
 
 
 def _clear_others(folder: Path, path: Path, same: Hypotheses | None, out: Console) -> None:
-    """Remove what earlier runs left beside `path`, for a folder's answer is joint over one frame: all objects, or with
-    `same` (one object of several was asked for) those of other frames.
+    """Remove results of earlier runs beside `path`: a folder's answer is joint over one frame. With `same` (one object
+    was asked for) only those of other frames.
     """
     for other in sorted(folder.glob("object_*.npz")):
         if other == path or not re.fullmatch(r"object_\d+\.npz", other.name):
@@ -196,9 +198,9 @@ def _is_of_frame(path: Path, h: Hypotheses) -> bool:
 
 
 def report(h: Hypotheses, out: Console, seconds: float | None = None, log: Sequence[str] = ()) -> None:
-    """One object: the answer in words, its numbers, what to do about doubts, and last the sampler's diagnostics.
+    """Print one object: the answer in words, its numbers, the warnings, and last the sampler's diagnostics.
 
-    `seconds` is how long inference took, `log` why it used as much model as it did.
+    `seconds` is the time of inference, `log` the reasons for the amount of model.
     """
     label = f" ({h.label})" if h.label else ""
     out.print(f"[bold]object {h.object_id}{escape(label)}:[/] {answer(summarise(h))}", highlight=False, soft_wrap=True)

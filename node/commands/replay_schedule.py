@@ -1,4 +1,4 @@
-"""`farside replay --schedule`: the inferences of a recording again, and whether they came out as they did then."""
+"""`farside replay --schedule`: repeat the inferences of a recording, and compare the results."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -47,10 +47,10 @@ def follow(config: ReplayConfig, out: Console, err: Console) -> bool:
     stamps = []
     for frame in playback:
         stamps.append(frame.stamp_ns)
-        if not (asked := by_stamp.get(frame.stamp_ns)):
+        if not (scheduled := by_stamp.get(frame.stamp_ns)):
             continue
-        looks = _looks(tracker, frame, asked, config, err)
-        for entry in asked:
+        looks = _looks(tracker, frame, scheduled, config, err)
+        for entry in scheduled:
             if entry.object_id not in looks:
                 err.print(f"object {entry.object_id} is not in the frame at {frame.stamp_ns} ns", highlight=False)
                 continue
@@ -83,10 +83,10 @@ def follow(config: ReplayConfig, out: Console, err: Console) -> bool:
 
 
 def _looks(
-    tracker: Tracker, frame: Frame, asked: Sequence[Scheduled], config: ReplayConfig, err: Console
+    tracker: Tracker, frame: Frame, scheduled: Sequence[Scheduled], config: ReplayConfig, err: Console
 ) -> dict[int, tuple[Segment, Look]]:
     """The objects of a frame that the schedule tells of, by id."""
-    how = {entry.object_id: (entry.seed, entry.started_from == "fresh") for entry in asked}
+    how = {entry.object_id: (entry.seed, entry.started_from == "fresh") for entry in scheduled}
     looks = {}
     try:
         segments = segment(frame, None, config.segment)
@@ -105,8 +105,8 @@ def _looks(
 
 
 def _check(path: Path, entries: Sequence[Scheduled], prior: Prior, config: ReplayConfig) -> None:
-    """Raises ValueError where another prior or configuration was recorded."""
-    asked = config_hash(config.inference, config.segment, config.track)
+    """Raises ValueError if another prior or configuration was recorded."""
+    current = config_hash(config.inference, config.segment, config.track)
     without_track = config_hash(config.inference, config.segment)  # what Farside before 0.2.0 recorded
     for entry in entries:
         if entry.prior_hash != prior.hash:
@@ -119,8 +119,8 @@ def _check(path: Path, entries: Sequence[Scheduled], prior: Prior, config: Repla
                 f"{path} was recorded by Farside before 0.2.0, whose schedules do not tell of the tracker's settings;"
                 " record it again, or replay it with the version that recorded it"
             )
-        if entry.config_hash != asked:
+        if entry.config_hash != current:
             raise ValueError(
-                f"{path} was recorded with configuration {entry.config_hash}, and this one is {asked}; give that one"
+                f"{path} was recorded with configuration {entry.config_hash}, and this one is {current}; give that one"
                 " with --config and --method"
             )

@@ -1,4 +1,4 @@
-"""Training a prior: the views, the run (resumed where it was stopped), its curves, and the weights in the end."""
+"""Training a prior: the views, the run (resumed after a stop), its curves, and the weights at the end."""
 
 import json
 import subprocess
@@ -33,9 +33,9 @@ from probnerf.training.surface_samples import Solids, draw_solids
 
 
 def train(options: Training, out: Console, err: Console) -> bool:
-    """Train, or go on where an earlier run of the same recipe in `options.out` was stopped. False after Ctrl-C.
+    """Train, or continue an earlier run of the same recipe in `options.out`. False after Ctrl-C.
 
-    Raises ValueError where the folder holds another recipe, FloatingPointError where the loss is no number.
+    Raises ValueError if the folder holds another recipe, FloatingPointError if the loss is not finite.
     """
     preset, config, folder = PRESETS[options.preset], options.recipe, options.out
     if options.data is not None:  # there is no phase in which a decoder could learn first
@@ -83,7 +83,7 @@ def train(options: Training, out: Console, err: Console) -> bool:
 
 
 def _material(options: Training, size: int, progress: Progress) -> tuple[Solids | None, ViewSet, dict[str, Any]]:
-    """What is trained on, and what the weights' metadata say of it."""
+    """The training data, and what the weights' metadata say about it."""
 
     def advance(task: TaskID) -> Callable[[int, int], None]:
         return lambda done, total: progress.update(task, completed=done, total=total)

@@ -1,4 +1,4 @@
-"""`farside view`: hypotheses files described, and shown on the page or drawn."""
+"""`farside view`: describe hypotheses files, and show them on the page or draw them."""
 
 import threading
 from collections.abc import Sequence
@@ -63,7 +63,7 @@ def draw(path: Path, picture: Path, out: Console, err: Console) -> None:
 
 
 def load_view(path: Path, scene: Sequence[Hypotheses], err: Console) -> CameraView | None:
-    """The frame that `replay` kept beside a hypotheses file, if it is the one that the objects were inferred from."""
+    """The frame that `replay` kept beside a hypotheses file, if the objects were inferred from it."""
     folder = frame_path(path if path.is_dir() else path.parent)
     if not (folder / "meta.json").is_file():
         return None

@@ -1,4 +1,4 @@
-"""`farside view --live`: the page of a node that runs somewhere else, from what it says on the bus."""
+"""`farside view --live`: the page of a node that runs elsewhere, from its messages on the bus."""
 
 import threading
 from collections import OrderedDict
@@ -15,13 +15,13 @@ from node.viewer.scene3d import CameraView, camera_view
 from perception.answers.hypotheses import Hypotheses
 from perception.sources.frame import Frame
 
-FRAMES = 300  # that are kept until their hypotheses come
+FRAMES = 300  # kept until their hypotheses arrive
 
 
 def watch(endpoint: str, node: str, port: int, token: bool, out: Console, err: Console) -> None:
-    """Show what the node `node` (such as /farside) at `endpoint` says, until Ctrl-C; `token` as `Page`.
+    """Show what the node `node` (such as /farside) at `endpoint` publishes, until Ctrl-C; `token` as `Page`.
 
-    Raises ValueError or OSError in one line: no endpoint, nobody there, or a port that is in use.
+    Raises ValueError or OSError in one line: no endpoint, no answer, or a port that is in use.
     """
     from node.viewer.page import Page  # viser takes a second to import
 
@@ -33,17 +33,17 @@ def watch(endpoint: str, node: str, port: int, token: bool, out: Console, err: C
         source = TopicSource(bus, camera_topics(node))
         shown = Shown()
         threading.Thread(target=shown.keep, args=(source,), daemon=True).start()
-        came = threading.Event()
+        arrival = threading.Event()
 
         def take(message: Any) -> None:
             scene = shown.take(hypotheses_from(message))
             page.show(scene, shown.view())
-            came.set()
+            arrival.set()
 
         bus.subscribe(f"{node}/hypotheses", HYPOTHESES, take, depth=10)
         out.print(f"{page.address} shows {node} at {endpoint}; Ctrl-C ends it", highlight=False, soft_wrap=True)
         try:
-            if not came.wait(10.0):
+            if not arrival.wait(10.0):
                 say(f"nothing from {node} at {endpoint} yet; is it running, and has it seen an object?")
             threading.Event().wait()
         except KeyboardInterrupt:
@@ -53,13 +53,13 @@ def watch(endpoint: str, node: str, port: int, token: bool, out: Console, err: C
 
 
 def camera_topics(node: str) -> TopicConfig:
-    """Where a node tells what its camera saw."""
+    """The topics on which a node publishes what its camera saw."""
     names = (f"{node}/color/image_raw", f"{node}/depth/image_raw", f"{node}/color/camera_info")
     return TopicConfig(*names)
 
 
 class Shown:
-    """The objects of the newest scene, and the frames that hypotheses may yet come for."""
+    """The objects of the newest scene, and recent frames whose hypotheses may still arrive."""
 
     def __init__(self) -> None:
         self._scene: dict[int, Hypotheses] = {}

@@ -22,13 +22,13 @@ def answer(
     Raises ValueError in one line.
     """
     result = query(scene, region, frame)
-    said = result.verdict(risk)
+    verdict = result.verdict(risk)
     if as_json:
-        told = {"verdict": said, "risk": risk, **result.as_dict()}
-        out.print(json.dumps(told, indent=1), highlight=False, soft_wrap=True, markup=False)
+        content = {"verdict": verdict, "risk": risk, **result.as_dict()}
+        out.print(json.dumps(content, indent=1), highlight=False, soft_wrap=True, markup=False)
         return
     table = Table.grid(padding=(0, 2))
-    for name, value in ((f"verdict at a risk of {risk:g}", said), *rows(result)):
+    for name, value in ((f"verdict at a risk of {risk:g}", verdict), *rows(result)):
         table.add_row(name, value)
     for object_id, blocking in result.blocked_by.items():
         table.add_row(f"not free in, object {object_id}", _numbers(blocking))
@@ -41,7 +41,7 @@ def answer(
 
 
 def rows(r: QueryResult) -> list[tuple[str, str]]:
-    """What is said of a region: names and values with units, in the order of reading."""
+    """The answer's names and values with units, in the order of reading."""
     v = {name: CM3 * value for name, value in r.volume_m3.items()}
     return [
         ("all of it is free", f"{r.p_free:.3f} ± {r.p_free_se:.3f}"),

@@ -65,7 +65,7 @@ def diagnostics(h: Hypotheses) -> dict[str, str]:
 
 
 def unexplained(h: Hypotheses) -> str:
-    """Why an answer that is flagged `out_of_model` is: the object, or too little time to tell."""
+    """Why an answer is flagged `out_of_model`: the object, or too little time."""
     if h.result in (StopReason.CONVERGED, StopReason.UNDERWAY):
         return "out of model: no shape of the prior explains this view"
     return f"no shape found so far explains this view: the sampler was cut short ({h.result}); give it more time"

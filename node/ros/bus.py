@@ -1,7 +1,8 @@
 """The bus: topics and services of ROS 2 on Zenoh, in the format of `rmw_zenoh_cpp` (`rmw_zenoh.py`), without ROS.
 
-Closed by default: it listens on this machine alone, finds nobody by multicast, and connects where it is told to.
-Whatever comes in is bounded in size, rate and number waiting; what is wrong is counted, said once, and passed over.
+Closed by default: it listens on this machine alone, does not search by multicast, and connects only to configured
+endpoints. Incoming messages are bounded in size, rate and queue length. Faulty ones are counted, reported once, and
+skipped.
 """
 
 import json
@@ -23,13 +24,13 @@ from node.ros.messages import decode, encode, make, type_hash
 from node.ros.rmw_zenoh import RosNode, attachment, gid, key, quality, read_attachment
 from node.ros.settings import BusConfig
 
-_HEARTBEAT_S = 0.5  # by which a late joiner notices that it missed a latched sample; as rmw_zenoh_cpp has it
+_HEARTBEAT_S = 0.5  # lets a late subscriber notice that it missed a latched sample; as in rmw_zenoh_cpp
 _SENDERS = 256  # whose sequence numbers are remembered
 
 
 @dataclass
 class Publisher:
-    """One topic to write to."""
+    """A topic to publish on."""
 
     name: str  # full
     kind: str
@@ -44,13 +45,13 @@ class Publisher:
 
     @property
     def wanted(self) -> bool:
-        """Whether somebody listens, or may later want the last message."""
+        """Whether there is a subscriber, or a late one may want the last message."""
         return self.latched or bool(self._publisher.matching_status.matching)
 
     def publish(self, message: Any) -> bool:
-        """Send a message to whoever listens now; it never waits for them. False where it was not sent (`counts`).
+        """Send a message to the present subscribers, without waiting for them. False if it was not sent (`counts`).
 
-        Raises ValueError where the message is of another type, or a field does not fit it.
+        Raises ValueError if the message is of another type, or a field does not fit it.
         """
         if message.__msgtype__ != self.kind:
             raise ValueError(f"{self.name} carries {self.kind}, not {message.__msgtype__}")
@@ -78,7 +79,7 @@ class Publisher:
 class Bus:
     """A node on the bus: `with Bus(config) as bus: ...`. Names are ROS names: ~/own, relative, or /absolute.
 
-    Raises OSError where an endpoint cannot be used, FileNotFoundError for a certificate that is not there.
+    Raises OSError if an endpoint cannot be used, FileNotFoundError for a certificate that is not there.
     """
 
     def __init__(self, config: BusConfig | None = None, say: Callable[[str], None] | None = None) -> None:
@@ -109,7 +110,7 @@ class Bus:
                 thread.join(5.0)
 
     def publisher(self, name: str, kind: str, *, latched: bool = False, depth: int = 1) -> Publisher:
-        """A topic to write to. `latched` (TRANSIENT_LOCAL): who joins late gets the last `depth` messages."""
+        """A topic to publish on. `latched` (TRANSIENT_LOCAL): late subscribers get the last `depth` messages."""
         name, where, source = self._entity("MP", name, kind, quality(depth, latched))
         drop = zenoh.CongestionControl.DROP  # rather than wait for a slow subscriber
         if latched:
@@ -130,10 +131,10 @@ class Bus:
     def subscribe(
         self, name: str, kind: str, handler: Callable[[Any], object], *, latched: bool = False, depth: int = 5
     ) -> str:
-        """Call `handler` with each message, in a thread of this subscription's own; gives the full name.
+        """Call `handler` with each message, in a thread of this subscription's own. Returns the full name.
 
-        While it works, the newest `depth` messages wait and older ones are dropped. `latched`: the last ones that were
-        sent before come first.
+        While it works, the newest `depth` messages wait and older ones are dropped. `latched`: the last messages sent
+        before come first.
         """
         name, where, _ = self._entity("MS", name, kind, quality(depth, latched))
         ring: Any = zenoh.handlers.RingChannel(depth)
@@ -156,9 +157,10 @@ class Bus:
         return name
 
     def serve(self, name: str, kind: str, handler: Callable[[Any], Any], *, depth: int = 10) -> str:
-        """Answer a service's requests with `handler`, one at a time in a thread of its own; gives the full name.
+        """Answer a service's requests with `handler`, one at a time in a thread of its own. Returns the full name.
 
-        What it raises is answered with success = false and the error's line as message, where the response has these.
+        An error in `handler` becomes a response with success = false and the error's line as message, if the type has
+        these.
         """
         name, where, _ = self._entity("SS", name, kind, quality(depth))
         queryable = self._session.declare_queryable(where, zenoh.handlers.RingChannel(depth), complete=True)
@@ -184,9 +186,9 @@ class Bus:
         return name
 
     def call(self, name: str, kind: str, request: Any, timeout_s: float = 5.0) -> Any:
-        """Ask a service and wait for its answer; until it is there to answer, the request is sent again.
+        """Call a service and wait for its response. The request is repeated until the service exists.
 
-        Raises TimeoutError where nobody answers in time, OSError where the service refuses.
+        Raises TimeoutError if there is no answer in time, OSError if the service refuses.
         """
         name = self.node.resolve(name)
         with self._lock:
@@ -210,8 +212,8 @@ class Bus:
             for reply in replies:
                 if reply.ok is not None:
                     return decode(reply.ok.payload.to_bytes(), f"{kind}_Response")
-                if (said := reply.err.payload.to_string()) != "Timeout":
-                    raise OSError(f"{name} refused: {said}")
+                if (refusal := reply.err.payload.to_string()) != "Timeout":
+                    raise OSError(f"{name} refused: {refusal}")
             time.sleep(min(0.05, max(0.0, left)))
         raise TimeoutError(
             f"{name} ({kind}) did not answer in {timeout_s:g} s; is its node up, on this domain and router?"
@@ -235,14 +237,14 @@ class Bus:
         return name, key(self.config.domain_id, name, kind, hashed), gid(token)
 
     def _run(self, name: str, source: Any, take: Callable, refuse: Callable | None = None) -> None:
-        """Take what comes from `source` in a thread, until it is undeclared; `refuse` answers a query that is wrong."""
+        """Handle what comes from `source` in a thread, until it is undeclared; `refuse` answers a faulty query."""
         rate, last, c = Rate(self.config.max_rate), dict[bytes, int](), self.config
         setting, limit = (
             ("max_request_bytes", c.max_request_bytes) if refuse else ("max_message_bytes", c.max_message_bytes)
         )
 
         def judge(item: Any) -> tuple[str, str]:
-            """What became of one item, and the trouble with it."""
+            """The fate of one item, and what was wrong with it."""
             try:
                 sequence, sender = tag = _tag(item)
                 if lost := max(0, sequence - last.get(sender, sequence) - 1):
@@ -258,7 +260,7 @@ class Bus:
                 take(item, tag)
             except ValueError as error:
                 return "refused" if refuse else "malformed", one_line(error)
-            except Exception as error:  # a handler's fault must not end the service
+            except Exception as error:  # an error in a handler must not end the service
                 return "failed", f"{type(error).__name__}: {one_line(error)}"
             return "received", ""
 
@@ -271,7 +273,7 @@ class Bus:
                         if trouble:
                             refuse(item, trouble)
                         item.drop()  # now, not when it is collected: the asker waits for the end of answers
-                    except zenoh.ZError as error:  # who asked has gone
+                    except zenoh.ZError as error:  # the client is gone
                         self.counts.add(name, "failed", one_line(error))
 
         thread = threading.Thread(target=loop, name=f"bus {name}", daemon=True)
@@ -298,7 +300,7 @@ def _open(config: BusConfig) -> zenoh.Session:
 
 
 def _tag(item: Any) -> tuple[int, bytes]:
-    """Number and sender of a sample or query. Raises ValueError where it carries none."""
+    """Number and sender of a sample or query. Raises ValueError if it carries none."""
     if item.attachment is None:
         raise ValueError("a message has no attachment; its sender does not speak as rmw_zenoh_cpp does")
     sequence, _, sender = read_attachment(item.attachment.to_bytes())

@@ -1,4 +1,4 @@
-"""What became of messages, and how many may come."""
+"""Counts of messages by fate, and a limit of their rate."""
 
 import threading
 import time
@@ -7,15 +7,16 @@ from collections.abc import Callable
 
 
 class MessageCounts:
-    """How many messages met which fate, by topic or service: sent, received, dropped, too_large, too_fast, malformed,
-    failed. The first trouble of each kind is said in a line."""
+    """Counts of messages by topic or service and fate: sent, received, dropped, too_large, too_fast, malformed, failed.
+    The first fault of each kind is reported in a line.
+    """
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say, self._lock = say, threading.Lock()
         self._counts: dict[str, Counter[str]] = {}
 
     def add(self, name: str, fate: str, trouble: str = "", count: int = 1) -> None:
-        """Count a fate; `trouble` is said if it is the first of its kind."""
+        """Count a fate; `trouble` is reported if it is the first of its kind."""
         with self._lock:
             counter = self._counts.setdefault(name, Counter())
             first = counter[fate] == 0

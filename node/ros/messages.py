@@ -1,4 +1,4 @@
-"""Messages of ROS 2 as the wire has them: types and their hashes, CDR, and Hypotheses to a message and back.
+"""Messages of ROS 2 as on the wire: types and their hashes, CDR, and Hypotheses to a message and back.
 
 The types of `launch/farside_msgs` are registered from those very files, so that this node and a ROS 2 workspace that
 builds them cannot differ. A message is an object with its fields by name; arrays of numbers are NumPy arrays. Poses are
@@ -53,7 +53,7 @@ EVENT = """service_msgs/ServiceEventInfo info
 
 @cache
 def types() -> Typestore:
-    """All types of ROS 2 Jazzy and those of farside_msgs. Raises FileNotFoundError where the definitions are absent."""
+    """All types of ROS 2 Jazzy and those of farside_msgs. Raises FileNotFoundError if the definitions are absent."""
     store = get_typestore(Stores.ROS2_JAZZY)
     store.fielddefs = _mended(store.fielddefs)
     if not (FOLDER / "package.xml").is_file():
@@ -70,8 +70,8 @@ def types() -> Typestore:
 def _mended(definitions: Any) -> Any:
     """Field definitions as ROS 2 has them.
 
-    It says `char` and means uint8, and hashes it so, where rosbags 0.11 has a type of its own; and rosbags puts what a
-    service is made of under srv/msg.
+    ROS 2 writes `char`, means uint8, and hashes it so; rosbags 0.11 has a type of its own for it. Also, rosbags puts
+    the parts of a service under srv/msg.
     """
     match definitions:
         case dict():
@@ -116,7 +116,7 @@ def definition(kind: str) -> str:
 
 
 def make(kind: str, /, **fields: Any) -> Any:
-    """A message of a type; what is left out is zero, empty or false. Raises ValueError for a field that it lacks."""
+    """A message of a type. Omitted fields are zero, empty or false. Raises ValueError for a field that it lacks."""
     defaults = {name: _default(description) for name, description in _fields(kind)}
     if strange := set(fields) - set(defaults):
         raise ValueError(f"{kind} has no field {', '.join(sorted(strange))}; it has {', '.join(defaults)}")
@@ -146,7 +146,7 @@ _DTYPES = {"byte": "uint8", "octet": "uint8"}
 
 
 def encode(message: Any) -> bytearray:
-    """The CDR bytes of a message. Raises ValueError where a field does not fit its type."""
+    """The CDR bytes of a message. Raises ValueError if a field does not fit its type."""
     kind = message.__msgtype__
     try:
         data: bytearray = types().serialize_cdr(message, kind, little_endian=True).obj  # type: ignore[assignment]
@@ -158,7 +158,7 @@ def encode(message: Any) -> bytearray:
 
 
 def decode(data: bytes, kind: str) -> Any:
-    """The message that CDR bytes hold. Raises ValueError where they hold none of this type."""
+    """The message in CDR bytes. Raises ValueError if they are no message of this type."""
     try:
         message = types().deserialize_cdr(data, kind)
     except (SerdeError, IndexError, OverflowError, MemoryError, AssertionError) as error:
@@ -191,7 +191,7 @@ def pose(T: Float[np.ndarray, "4 4"]) -> Any:
 
 
 def matrix(message: Any) -> Float[np.ndarray, "4 4"]:
-    """The rigid transform of a geometry_msgs/Pose. Raises ValueError where its quaternion is none."""
+    """The rigid transform of a geometry_msgs/Pose. Raises ValueError if its quaternion is none."""
     p, q = message.position, message.orientation
     values = np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w], np.float64)
     if not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1.0) > 1e-3:
@@ -217,9 +217,9 @@ def image_message(stamp_ns: int, frame_id: str, pixels: Shaped[np.ndarray, "h w 
 
 
 def frame_messages(frame: Frame) -> dict[str, Any]:
-    """A frame's messages by topic, as a camera driver sends them: what `TopicSource` makes the same frame of.
+    """A frame's messages by topic, as a camera driver sends them; `TopicSource` turns them back into the same frame.
 
-    T_world_camera and labels are no camera's to send.
+    T_world_camera and labels are left out: a camera does not send them.
     """
     camera, stamp = frame.camera, (frame.stamp_ns, frame.frame_id)
     info = make(
@@ -281,7 +281,7 @@ def hypotheses_message(h: Hypotheses, method: str = "") -> Any:
 
 
 def hypotheses_from(message: Any) -> Hypotheses:
-    """The Hypotheses of a farside_msgs/ShapeHypotheses. Raises ValueError where its parts do not fit each other."""
+    """The Hypotheses of a farside_msgs/ShapeHypotheses. Raises ValueError if its parts do not fit each other."""
     m, count, grid = message, len(message.weights), int(message.grid)
     sizes = {"opacity": count * grid**3, "poses": 5 * count, "populations": count, "seen_bits": -(-(grid**3) // 8)}
     for name, want in sizes.items():

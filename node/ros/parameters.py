@@ -1,4 +1,4 @@
-"""The node's settings as ROS 2 parameters, to read: `ros2 param list`, `get` and `describe` work, `set` is refused."""
+"""The node's settings as read-only ROS 2 parameters: `ros2 param list`, `get` and `describe` work, `set` is refused."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -13,7 +13,7 @@ Parameter = bool | int | float | str | tuple[str, ...]
 
 
 def flat(config: object, prefix: str = "") -> dict[str, Parameter]:
-    """A configuration's fields by dotted name; None is left out, and what is no plain value is its text."""
+    """A configuration's fields by dotted name. None is left out; any value that is not plain becomes its text."""
     found: dict[str, Parameter] = {}
     for field in fields(config):  # type: ignore[arg-type]
         name, value = f"{prefix}{field.name}", getattr(config, field.name)

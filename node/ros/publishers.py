@@ -1,4 +1,4 @@
-"""What the node tells the bus of each scene: the topics that a planner, a person and ROS 2's tools look at."""
+"""What the node publishes for each scene: the topics for a planner, a person, and ROS 2's tools."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -20,12 +20,12 @@ from perception.answers.hypotheses import Hypotheses
 from perception.sources.frame import Frame
 
 _CAMERA = {"color/image_raw": "Image", "color/camera_info": "CameraInfo", "depth/image_raw": "Image"}
-LATCHED = 8  # objects of which a late joiner gets the hypotheses
+LATCHED = 8  # objects whose hypotheses a late subscriber gets
 
 
 class Announcer:
     """Publishes ~/hypotheses (latched), ~/occupancy, ~/markers, ~/uncertainty, /diagnostics, /tf, and the camera's
-    ~/color/image_raw, ~/color/camera_info and ~/depth/image_raw. What nobody listens to is not computed.
+    ~/color/image_raw, ~/color/camera_info and ~/depth/image_raw. A topic without subscribers is not computed.
     """
 
     def __init__(self, bus: Bus) -> None:
@@ -42,7 +42,7 @@ class Announcer:
 
     @property
     def node(self) -> str:
-        """The node's full name, such as /farside, which its objects' frames begin with."""
+        """The node's full name, such as /farside. The names of its objects' frames begin with it."""
         return self._node
 
     def frame(self, frame: Frame) -> None:
@@ -52,7 +52,7 @@ class Announcer:
                 self._camera[name].publish(message)
 
     def scene(self, objects: Sequence[Hypotheses], camera: Camera, method: str = "") -> None:
-        """Publish all that there is to say of one scene. `camera` is that of the picture."""
+        """Publish everything about one scene. `camera` is that of the picture."""
         for h in objects:
             self._hypotheses.publish(hypotheses_message(h, method))
         if not objects:
@@ -68,7 +68,7 @@ class Announcer:
                 publisher.publish(build())
 
     def status(self, objects: Sequence[Hypotheses], others: Sequence[DiagnosticStatus] = ()) -> None:
-        """Publish /diagnostics: the sampler's word on each object, the bus's counts, and `others` (camera, rates)."""
+        """Publish /diagnostics: the sampler's state for each object, the bus's counts, and `others` (camera, rates)."""
         now = time.time_ns()
         statuses = [*others, *(sampler_status(h, now) for h in objects), counts_status(self._bus.counts.all())]
         self._diagnostics.publish(diagnostics_message(now, statuses))

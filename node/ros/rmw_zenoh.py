@@ -13,7 +13,7 @@ _DEFAULT_DEPTH = 42  # of rmw_zenoh_cpp's default quality of service, which is l
 
 @dataclass(frozen=True)
 class RosNode:
-    """A node's name and the session that it speaks in."""
+    """A node's name and its Zenoh session."""
 
     domain: int
     zid: str  # of the session
@@ -63,7 +63,7 @@ def attachment(sequence: int, time_ns: int, source: bytes) -> bytes:
 
 
 def read_attachment(data: bytes) -> tuple[int, int, bytes]:
-    """(sequence, time in ns, gid). Raises ValueError where the bytes are no attachment."""
+    """(sequence, time in ns, gid). Raises ValueError if the bytes are no attachment."""
     if len(data) != _ATTACHMENT.size or data[16] != 16:
         raise ValueError(f"the attachment has {len(data)} bytes; rmw_zenoh_cpp sends {_ATTACHMENT.size}")
     sequence, time_ns, _, source = _ATTACHMENT.unpack(data)

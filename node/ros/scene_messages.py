@@ -1,4 +1,4 @@
-"""What people and planners look at: a scene's hypotheses as point cloud, markers and picture; diagnostics; frames."""
+"""Messages for people and planners: a scene as point cloud, markers and picture; diagnostics; frames."""
 
 import colorsys
 from collections.abc import Mapping, Sequence
@@ -122,7 +122,7 @@ def _points(corners: np.ndarray) -> list[Any]:
 
 
 def uncertainty_message(scene: Sequence[Hypotheses], camera: Camera) -> Any:
-    """Per pixel of the camera the largest disagreement (nats) that its ray meets in what no pixel has seen: 32FC1."""
+    """Per pixel of the camera the largest disagreement (nats) along its ray in unseen space: 32FC1."""
     return image_message(scene[0].stamp_ns, scene[0].frame_id, uncertainty(scene, camera), "32FC1")
 
 
@@ -192,7 +192,7 @@ def diagnostics_message(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> 
 
 
 def sampler_status(h: Hypotheses, now_ns: int) -> DiagnosticStatus:
-    """What the sampler says of one object."""
+    """The sampler's state for one object."""
     message = h.result if not h.out_of_model else f"{h.result}; {unexplained(h)}"
     age = (now_ns - h.stamp_ns) * 1e-9
     values = {"age (s)": age, "stage": h.stage, "monte carlo error": h.monte_carlo_error}
@@ -201,7 +201,7 @@ def sampler_status(h: Hypotheses, now_ns: int) -> DiagnosticStatus:
 
 
 def counts_status(counts: Mapping[str, Mapping[str, int]]) -> DiagnosticStatus:
-    """What the bus sent, took and left out, by topic or service."""
+    """Counts of messages sent, received and dropped, by topic or service."""
     values = {f"{name} {fate}": n for name, fates in sorted(counts.items()) for fate, n in sorted(fates.items())}
     trouble = sum(n for fates in counts.values() for fate, n in fates.items() if fate not in ("sent", "received"))
     message = f"{trouble} messages dropped or refused" if trouble else "all messages passed"

@@ -1,4 +1,4 @@
-"""The node's services: requests become questions of `perception`, and what they answer becomes responses."""
+"""The node's services: requests become questions to `perception`, answers become responses."""
 
 import time
 from collections.abc import Sequence
@@ -22,22 +22,22 @@ MAX_VIEWS = 100
 
 
 class Answers:
-    """The newest scene, which every answer reads whole: inference may replace it at any time, from any thread."""
+    """The newest scene. Every answer reads it whole: inference may replace it at any time, from any thread."""
 
     def __init__(self, node: str = "/farside") -> None:
-        """`node` is the node's full name, which its objects' frames begin with."""
+        """`node` is the node's full name. The names of its objects' frames begin with it."""
         self.node = node
         self._scene: Scene | None = None
 
     def update(self, objects: Sequence[Hypotheses]) -> None:
-        """Put a scene in place of the last. What answers need of it is computed before, so that they do not wait."""
+        """Replace the scene. What answers need is computed first, so that they do not wait."""
         for h in objects:
             _ = h.p_occupied, h.twins  # cached; p_occupied fills `solid`
         self._scene = Scene(tuple(objects)) if objects else None
 
     @property
     def scene(self) -> Scene:
-        """Raises ValueError before the first."""
+        """The newest scene. Raises ValueError before the first."""
         if (scene := self._scene) is None:
             raise ValueError("there are no hypotheses yet; ask again when the node has seen an object")
         return scene
@@ -48,7 +48,7 @@ class Answers:
         bus.serve("~/next_view", NEXT_VIEW, self.next_view)
 
     def query_region(self, request: Any) -> Any:
-        """Answer a farside_msgs/QueryRegion request. Raises ValueError in one line for what cannot be asked."""
+        """Answer a farside_msgs/QueryRegion request. Raises ValueError in one line for an invalid request."""
         scene = self._asked(request)
         objects = scene.objects
         found = query(objects, _region(request), self._frame(request.header.frame_id, objects))
@@ -73,19 +73,21 @@ class Answers:
         )
 
     def next_view(self, request: Any) -> Any:
-        """Answer a farside_msgs/NextView request. Raises ValueError in one line for what cannot be asked.
+        """Answer a farside_msgs/NextView request. Raises ValueError in one line for an invalid request.
 
-        Poses are turned into the first object's frame and back.
+        Poses are transformed into the first object's frame and back.
         """
         scene = self._asked(request)
         objects = scene.objects
         T_object_frame = objects[0].T_object_from(self._frame(request.header.frame_id, objects))
-        given = len(request.candidates)
-        if max(given, request.count) > MAX_VIEWS:
-            raise ValueError(f"{max(given, request.count)} views are too many; give at most {MAX_VIEWS}")
-        cameras = np.stack([T_object_frame @ matrix(p) for p in request.candidates]) if given else None
-        rank_views = import_module("perception.answers.next_view").rank_views  # here: it is heavy, and few ask
-        ranked = rank_views(objects, cameras, request.count or given or RING)
+        candidates = len(request.candidates)
+        if max(candidates, request.count) > MAX_VIEWS:
+            raise ValueError(f"{max(candidates, request.count)} views are too many; give at most {MAX_VIEWS}")
+        cameras = np.stack([T_object_frame @ matrix(p) for p in request.candidates]) if candidates else None
+        rank_views = import_module(
+            "perception.answers.next_view"
+        ).rank_views  # imported here: it is heavy and rarely needed
+        ranked = rank_views(objects, cameras, request.count or candidates or RING)
         T_frame_object = np.linalg.inv(T_object_frame)
         return make(
             f"{NEXT_VIEW}_Response",
@@ -103,8 +105,8 @@ class Answers:
         return Scene((scene.by_id(request.object_id),))
 
     def _frame(self, name: str, objects: Sequence[Hypotheses]) -> FrameName:
-        """Which of our frames a request means by a frame_id. Raises ValueError for another one, and for an object's
-        frame where several objects are asked together.
+        """The frame that a request's frame_id names. Raises ValueError for an unknown one, and for an object's frame if
+        several objects are asked together.
         """
         own = [object_frame_id(self.node, h.object_id) for h in objects]
         aliases: dict[str, FrameName] = {"object": "object", "camera": "camera", "world": "world"}
@@ -120,7 +122,7 @@ class Answers:
 
 
 def _about(scene: Scene, age_s: float) -> dict[str, Any]:
-    """Of the oldest picture, and of the object that was sampled least."""
+    """The stamp of the oldest picture, and the stage of the object that was sampled least."""
     return {"stamp": time_message(min(h.stamp_ns for h in scene)), "stage": min(h.stage for h in scene), "age": age_s}
 
 

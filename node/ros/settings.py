@@ -9,14 +9,14 @@ from perception.sources.topic_names import named_otherwise
 
 _NODE = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _SPACE = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
-# What one may do who is admitted by his certificate: everything that nodes of ROS 2 do, on this domain alone.
+# What an admitted certificate allows: everything that nodes of ROS 2 do, on this domain alone.
 _MESSAGES = ["put", "delete", "query", "reply", "declare_subscriber", "declare_queryable"]
 _GRAPH = ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
 
 
 @dataclass(frozen=True)
 class BusConfig:
-    """Where the bus listens and whom it admits."""
+    """Where the bus listens, and whom it admits."""
 
     domain_id: int = 0
     namespace: str = "/"
@@ -27,9 +27,9 @@ class BusConfig:
     tls_ca: Path | None = None  # certificate authority that both sides' certificates must come from (mutual TLS)
     tls_certificate: Path | None = None
     tls_key: Path | None = None
-    allowed: tuple[str, ...] = ()  # common names of the certificates that are admitted; none: all that TLS lets in
+    allowed: tuple[str, ...] = ()  # common names of the admitted certificates; none: all that TLS admits
     max_message_bytes: int = 64_000_000
-    max_request_bytes: int = 4_000_000  # of what a service is asked
+    max_request_bytes: int = 4_000_000  # of a service's request
     max_rate: float = 200.0  # messages per second of each topic and service, in and out
 
     def __post_init__(self) -> None:
@@ -67,10 +67,10 @@ class BusConfig:
             "mode": self.mode,
             "listen": {"endpoints": list(self.listen) if self.mode == "peer" else []},
             "connect": {"endpoints": list(self.connect)},
-            # Nobody is sought by multicast. Who is connected says who else is there, as nodes of ROS 2 find each other.
+            # No search by multicast. Connected nodes announce the others (gossip), as nodes of ROS 2 find each other.
             "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True}},
             "timestamping": {"enabled": True},  # which late joiners need
-            # A sender of more than the limit is heard and counted; far beyond it, its connection ends.
+            # A sender above the limit is received and counted; far above it, its connection ends.
             "transport": {"link": {"rx": {"max_message_size": 2 * self.max_message_bytes + (1 << 20)}}},
         }
         if self.tls_key is not None:

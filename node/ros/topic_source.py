@@ -17,11 +17,10 @@ _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "C
 
 
 class TopicSource:
-    """A live source: iterate over it for the newest frames; those that come while a frame is worked on are left out.
+    """A live source: iterate over it for the newest frames. Frames that arrive while one is processed are skipped.
 
-    `notes` says what was missing or wrong, once a kind and how often; `dropped` counts the colour images that found no
-    depth and are left out, `skipped` the frames that came too fast. It listens until `bus` ends; `close` ends an
-    iteration.
+    `notes` reports what was missing or wrong, once a kind and how often. `dropped` counts the colour images without
+    depth, `skipped` the frames that came too fast. It listens until `bus` ends; `close` ends an iteration.
     """
 
     live = True
@@ -50,7 +49,7 @@ class TopicSource:
 
     @property
     def notes(self) -> list[str]:
-        """What was missing or wrong until now."""
+        """What was missing or wrong so far."""
         with self._changed:
             return [text + (f" ({count} times)" if count > 1 else "") for text, count in self._notes.values()]
 
@@ -108,7 +107,7 @@ class TopicSource:
         self._make_frame()
 
     def _settle(self, matches: list[Match[Any, Any]]) -> None:
-        """Keep the newest pair; count what is left out. The lock is held."""
+        """Keep the newest pair; count what is dropped. The lock is held."""
         depth = self.config.depth
         for match in matches:
             found = None if depth is None else match.partners[depth]
@@ -125,7 +124,7 @@ class TopicSource:
                 )
 
     def _make_frame(self) -> None:
-        """The newest frame from the pair that is complete, if there is one."""
+        """The newest frame from the complete pair, if there is one."""
         with self._changed:
             if self._info is None or self._matched is None:
                 return
@@ -158,7 +157,7 @@ class TopicSource:
         return Frame(to_rgb(colour), metres, camera, stamp_ns=stamp, frame_id=frame_of(colour))
 
     def _stamp(self, topic: str, message: Any) -> int:
-        """The stamp of an image (ns), or the time of its arrival once any came without. The lock is held."""
+        """The stamp of an image (ns), or its time of arrival once one came without a stamp. The lock is held."""
         stamp = stamp_ns(message)
         if not stamp:
             self._by_arrival = True

@@ -28,9 +28,9 @@ class Page:
     """A page on 127.0.0.1 that shows one scene at a time. Close it, or use it in a `with`."""
 
     def __init__(self, port: int = 8765, token: bool = False) -> None:
-        """Open the page; port 0 takes a free one, and with `token` only who knows the address sees it.
+        """Open the page. Port 0 takes a free one; with `token` only those who know the address can open it.
 
-        Raises OSError or ValueError where `port` cannot be had.
+        Raises OSError or ValueError if `port` cannot be used.
         """
         self._server = GuardedServer(port, token)
         self._lock = threading.RLock()  # held while the scene is read or replaced
@@ -51,9 +51,9 @@ class Page:
         return self._server.address
 
     def show(self, scene: Sequence[Hypotheses], view: CameraView | None = None) -> None:
-        """Replace what is shown. The box stays where it is, after the first scene; so do all switches.
+        """Replace the scene. After the first scene the box and all switches stay as they are.
 
-        Raises ValueError where the scene has no objects, or objects of different frames.
+        Raises ValueError if the scene has no objects, or objects of different frames.
         """
         placed = scene3d.place(scene)
         unseen = scene3d.cloud(placed)

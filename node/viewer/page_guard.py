@@ -59,7 +59,7 @@ class GuardedServer(viser.ViserServer):
     def __init__(self, port: int, token: bool = False) -> None:
         """Serve on `port`, 0 for a free one; with `token`, at an address that nobody guesses.
 
-        Raises OSError or ValueError in one line where `port` cannot be had.
+        Raises OSError or ValueError in one line if `port` cannot be had.
         """
         _check_port(port)
         guard = _Guard(secrets.token_urlsafe(16) if token else None)
@@ -110,7 +110,9 @@ class _Guard:
             "process_request": lambda connection, request: self._process(respond, connection, request),
             "max_size": MAX_MESSAGE,
             "open_timeout": OPEN_TIMEOUT_S,
-            "logger": logging.Logger(__name__, logging.CRITICAL),  # a stranger's garbage is no error of ours
+            "logger": logging.Logger(
+                __name__, logging.CRITICAL
+            ),  # garbage from a stranger is not an error of this program
         }
         asyncio.get_running_loop().set_exception_handler(_drop)  # of tasks that handle a client's messages
         return _SERVE(self._handler(handler), *address, **options)
@@ -149,8 +151,8 @@ class _Guard:
             return None
         if self.token is None:
             return request.path
-        given, _, rest = re.split(r"[?#]", request.path, maxsplit=1)[0].removeprefix("/").partition("/")
-        return f"/{rest}" if hmac.compare_digest(_bytes(given), _bytes(self.token)) else None
+        prefix, _, rest = re.split(r"[?#]", request.path, maxsplit=1)[0].removeprefix("/").partition("/")
+        return f"/{rest}" if hmac.compare_digest(_bytes(prefix), _bytes(self.token)) else None
 
 
 def _bytes(text: str) -> bytes:

@@ -1,4 +1,4 @@
-"""The page's words: HTML of its legends, of a box's answer, and of what makes the scene doubtful."""
+"""The page's texts as HTML: legends, the answer about a box, and warnings about the scene."""
 
 import time
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ def box(inner: str, size: str = "13px") -> str:
 
 
 def answer(result: QueryResult, centre: Float[np.ndarray, "3"], size: Float[np.ndarray, "3"], frame: str) -> str:
-    """What is known of the box, the probability that it is free in large, and its corners to ask again."""
+    """The answer about a box: the probability that it is free in large, and its corners to repeat the question."""
     grey = 'style="color:#666;padding-right:8px;vertical-align:top"'
     cells = "".join(f"<tr><td {grey}>{escape(k)}</td><td>{escape(v)}</td></tr>" for k, v in rows(result)[1:])
     corners = " ".join(f"{v:.3f}" for v in (*(centre - 0.5 * size), *(centre + 0.5 * size)))
@@ -103,7 +103,7 @@ def scale(ramp: Sequence[str], title: str, low: str, high: str) -> str:
 
 
 def state(scene: Sequence[Hypotheses], now_ns: int | None = None) -> str:
-    """Doubts first, then how far each object's inference came, its Monte Carlo error and its age, in plain words."""
+    """For each object the warnings, the progress of inference, its Monte Carlo error and its age, in plain words."""
     lines = []
     for h in scene:
         name = f"object {h.object_id}" + (f" ({escape(h.label)})" if h.label else "")

@@ -70,7 +70,7 @@ def camera_view(frame: Frame, scene: Sequence[Hypotheses]) -> CameraView:
 
     Segments belong to objects by the frame's label map. Without one they are numbered by size, which says nothing about
     the objects' ids: there a segment belongs to the object at its place. An object without a segment has no statuses.
-    Raises ValueError where the frame is not the scene's.
+    Raises ValueError if the frame is not the scene's.
     """
     for h in scene:
         if (h.stamp_ns, h.frame_id) != (frame.stamp_ns, frame.frame_id):

@@ -1,4 +1,4 @@
-"""The hypotheses file: what one object's `Hypotheses` are kept in, and a folder of them.
+"""The hypotheses file: one object's `Hypotheses` on disk, and a folder of them.
 
 The file is a NumPy `.npz` without pickles. `header` holds the UTF-8 bytes of a JSON object with `format` and the scalar
 fields of `Hypotheses` and of its ObjectFrame by their own names, and with `diagnostics`, an object of numbers by name
@@ -31,7 +31,7 @@ def hypotheses_path(folder: str | Path, object_id: int) -> Path:
 
 
 def frame_path(folder: str | Path) -> Path:
-    """Where the frame that a folder's hypotheses were inferred from is kept, as a frame folder."""
+    """The frame folder that is kept beside a folder's hypotheses: the frame that they were inferred from."""
     return Path(folder) / "frame"
 
 

@@ -35,7 +35,7 @@ class NextViewConfig:
     wall_sigma: float = 0.05  # cube units; ranges of one shape differ so much from model to camera
     mask_error: float = 0.01  # chance that a pixel is taken for object or background wrongly
     power: float = 0.5  # pixels' errors are not independent: each counts as at most so much
-    present: float = 0.25  # mean distance of the hypotheses' pictures in the present view, which told all it could
+    present: float = 0.25  # mean distance of the hypotheses' pictures in the present view, whose information is used up
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +169,7 @@ def first_hits(
 
 
 def packed(solid: Bool[np.ndarray, "S G G G"]) -> list[UInt64[np.ndarray, "g g g"]]:
-    """Which shapes fill each voxel, 64 of them a word: one look-up tells of all. With a border, for `met`."""
+    """The shapes that fill each voxel, as bits of 64 each: one look-up serves all. With a border, for `met`."""
     words = []
     for start in range(0, len(solid), 64):
         word = np.zeros(solid.shape[1:], np.uint64)

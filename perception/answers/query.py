@@ -29,11 +29,11 @@ JOINT_DRAWS = 4096  # of the scene's volume, where there are several objects
 
 @dataclass(frozen=True)
 class QueryResult:
-    """What is known of a region. Space outside every object's cube counts as free here: read `outside_fraction` too."""
+    """The answer about a region. Space outside every object's cube counts as free here: read `outside_fraction` too."""
 
     p_free: float  # probability that no occupied voxel lies in the region
     p_free_se: float  # its Monte Carlo standard error
-    p_free_few: float  # p_free by the rule of succession: what so few hypotheses can tell of it
+    p_free_few: float  # p_free by the rule of succession: what so few hypotheses can support
     volume_m3: dict[
         str, float
     ]  # occupied volume in the region: quantiles q05, q50, q95 (points: of the voxels they hit)
@@ -97,7 +97,7 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
         touched.append(h)
         p_free.append(float(free))
         p_free_se.append(float(se))
-        n = 1.0 if h.alone else h.effective_hypotheses  # one population is one witness
+        n = 1.0 if h.alone else h.effective_hypotheses  # one population counts as one hypothesis
         p_free_few.append((n * float(free) + 1.0) / (n + 2.0))
         volumes.append((filled, weights))
         entropies.append(binary_entropy(marginal(h)[index]))

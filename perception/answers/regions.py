@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-REACH = 1e6  # m from the frame's origin that a region may lie: beyond, sizes and volumes overflow
+REACH = 1e6  # m; a region may lie so far from the frame's origin. Farther, sizes and volumes overflow
 MOST_CELLS = 20_000_000  # of the box about a mesh
 
 
@@ -75,7 +75,7 @@ class Swept:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """The union of N >= 1 cubes of one size on a lattice, such as a mesh fills (`read_mesh`)."""
+    """The union of N >= 1 equal cubes on a lattice, such as the inside of a mesh (`read_mesh`)."""
 
     centres: Float[np.ndarray, "N 3"]  # in the frame of the question, metres
     width: float  # of a cube, metres
@@ -90,7 +90,7 @@ Region = Box | Points | Swept | Cells
 
 
 def read_points(path: str | Path) -> Points:
-    """Read an .xyz file: one point a line, x y z in metres; further columns and # comments are left out.
+    """Read an .xyz file: one point a line, x y z in metres; further columns and # comments are ignored.
 
     Raises FileNotFoundError, or ValueError naming the line.
     """
@@ -112,7 +112,7 @@ def read_points(path: str | Path) -> Points:
         raise ValueError(f"{path}, line {number}: '{line[:60]}' is not a point; write x y z (metres)") from None
     if not (finite := np.isfinite(points).all(axis=1)).all():
         number, line = lines[int(finite.argmin())]
-        raise ValueError(f"{path}, line {number}: '{line[:60]}' is not finite; leave the line out")
+        raise ValueError(f"{path}, line {number}: '{line[:60]}' is not finite; remove the line")
     return Points(points)
 
 
@@ -120,7 +120,7 @@ def read_mesh(path: Path, width: float) -> Cells:
     """What a mesh file (.obj, .stl, .ply, .off, .glb; metres) fills, in its own frame: cells that its surface meets or
     encloses. A surface with an opening wider than a cell encloses nothing there.
 
-    Raises FileNotFoundError, or ValueError where the file holds no triangles or would fill more than `MOST_CELLS`.
+    Raises FileNotFoundError, or ValueError if the file holds no triangles or would fill more than `MOST_CELLS`.
     """
     import trimesh
 

@@ -1,4 +1,4 @@
-"""Scene: the hypotheses of all objects of one frame, which questions are asked of together."""
+"""Scene: the hypotheses of all objects of one frame. Queries ask all of them together."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,7 +28,7 @@ class Scene(Sequence[Hypotheses]):
         return iter(self.objects)
 
     def by_id(self, object_id: int) -> Hypotheses:
-        """The object of this id. Raises `ValueError` that names those there are."""
+        """The object of this id. Raises `ValueError` that lists the ids."""
         for h in self.objects:
             if h.object_id == object_id:
                 return h

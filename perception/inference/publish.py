@@ -1,4 +1,4 @@
-"""A posterior as planners read it: from samples to Hypotheses."""
+"""From a posterior's samples to Hypotheses."""
 
 from dataclasses import dataclass, replace
 
@@ -24,7 +24,7 @@ from probnerf.types import Observation, Posterior
 
 @dataclass(frozen=True, eq=False)
 class ConditionedView:
-    """What inference is conditioned on, and the frame that the answer is given in: the newest one."""
+    """The observation that inference is conditioned on, and the frame of the answer: the newest one."""
 
     frame: Frame
     segment: Segment
@@ -44,20 +44,20 @@ def published(
     point_gradients: float = float("nan"),
     evidence_power: float = float("nan"),
 ) -> Hypotheses:
-    """A posterior as planners read it. The last two become diagnostics of it."""
+    """The posterior as Hypotheses. The last two arguments become diagnostics of it."""
     chosen, weights, population = thin(posterior, config.hypotheses)
     sizeless = without_sizes(likelihood)
-    # NumPy: how many there are to choose from varies, and nothing may compile for it
+    # NumPy, because the number of samples varies, and nothing may compile for it
     positions, pose_sigma = jax.device_put(np.asarray(posterior.positions)[chosen]), view.observation.pose_sigma
     fit = float(weights @ np.asarray(explained(prior.model, sizeless, view.observation, positions), np.float64))
     cube = view.object_frame
-    if cube.sight_sigma > 0.0:  # what no pixel tells is not sampled: each sample draws it from its prior
+    if cube.sight_sigma > 0.0:  # no pixel informs it, so it is not sampled: each sample draws it from its prior
         key = jax.random.fold_in(jax.random.key(seed), 1)
         drawn = cube.sight_sigma * jax.random.normal(key, posterior.log_weights.shape)
         camera = jnp.asarray(cube.to_cube(np.zeros(3)), jnp.float32)
         positions = scaled_about(prior.model, positions, pose_sigma, camera, drawn[jnp.asarray(chosen)])
-    asked = answered_voxels(view.frame, view.segment, cube, config.grid)
-    opacity = opacity_grids(prior.model, sizeless, positions, pose_sigma, jax.device_put(asked))
+    region = answered_voxels(view.frame, view.segment, cube, config.grid)
+    opacity = opacity_grids(prior.model, sizeless, positions, pose_sigma, jax.device_put(region))
     pose = poses(prior.model, sizeless, positions, pose_sigma)
     d = posterior.diagnostics
     draft = Hypotheses(

@@ -25,7 +25,7 @@ def estimate_each(
     kept_back_s: float = 0.0,
     on_stage: Callable[[int, StageInfo], bool | None] | None = None,
 ) -> Iterator[tuple[Segment, Estimate | ValueError]]:
-    """Each segment's estimate as it is done, or why there is none.
+    """Each segment's estimate, or the reason why there is none.
 
     An object gets its share of the time that is left until `deadline` (of `time.monotonic`), less `kept_back_s` that
     the caller spends on each answer; at least a second. `on_stage` gets the object's id with every stage. The iteration

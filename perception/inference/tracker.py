@@ -45,7 +45,7 @@ class Change(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """What one frame did to what is known of one object."""
+    """The effect of one frame on one object."""
 
     change: Change
     hypotheses: Hypotheses
@@ -56,7 +56,7 @@ class Update:
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    """One view that the posterior is conditioned on."""
+    """One view of the posterior's condition."""
 
     observation: Observation
     direction: Float[np.ndarray, "3"]  # from the cube's centre to the camera, unit
@@ -64,7 +64,7 @@ class _Kept:
 
 @dataclass(frozen=True, eq=False)
 class _Track:
-    """What is known of one object."""
+    """The state of one object."""
 
     anchor: ObjectFrame  # in the first frame's camera
     first: Frame
@@ -77,7 +77,7 @@ class _Track:
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What a first look at a frame's segment tells, before any sampling."""
+    """The result of a first look at a frame's segment, before any sampling."""
 
     object_id: int  # the object's own, which stays from frame to frame
     change: Change
@@ -90,12 +90,12 @@ class Look:
 
     @property
     def builds_on(self) -> bool:
-        """What is to be inferred goes on from what was known of the object."""
+        """Whether inference continues from what is known of the object."""
         return self.change in (Change.VIEW, Change.CONTINUED)
 
     @property
     def settled(self) -> bool:
-        """There is nothing to infer."""
+        """Whether there is nothing to infer."""
         return self.change == Change.SAME
 
 
@@ -118,7 +118,7 @@ class Tracker:
         stages: int | None = None,
         on_answer: Callable[[Hypotheses], None] | None = None,
     ) -> Update:
-        """Take a frame's segment into account: `look`, and `infer` where there is something to infer."""
+        """Process a frame's segment: `look`, then `infer` if there is something to infer."""
         look = self.look(frame, segment)
         assert look is not None
         return self.infer(look, Limits(stages=stages), Callbacks(on_answer=on_answer))
@@ -157,7 +157,7 @@ class Tracker:
         return Look(name, change, agreement, None, seed, view, (_Kept(observation, _direction(found)),), None)
 
     def infer(self, look: Look, limits: Limits = NO_LIMITS, callbacks: Callbacks = NO_CALLBACKS) -> Update:
-        """Sample what a look left to be inferred, and keep it. Where something is known of the object already, the
+        """Sample what a look left to infer, and keep the result. If something is known of the object already, the
         encoder's guess is not handed out.
         """
         track = look._track
@@ -192,7 +192,7 @@ class Tracker:
         return Update(look.change, result.hypotheses, result.hypotheses.stage, look.agreement, result.seconds)
 
     def _name(self, frame: Frame, segment: Segment, found: ObjectFrame) -> int:
-        """The id of the object that a segment shows: by its label, or else by its place; a new one for a new object."""
+        """The id of the object that a segment shows: by its label, or else by its place; a new id for a new object."""
         if frame.label is not None:
             return segment.id
         distances = {}
@@ -208,7 +208,7 @@ class Tracker:
         return name
 
     def _go_on(self, name: int, track: _Track, view: ConditionedView, agreement: float, seed: int) -> Look:
-        """The look at an object that stands where it stood."""
+        """The look at an object that has not moved."""
         seen = seen_voxels(view.frame, view.segment, view.object_frame, self.config.grid)
         hidden = above_plane(self.config.grid) & ~track.seen
         adds = float((hidden & seen).sum()) / max(int(hidden.sum()), 1) >= self.track.adds
@@ -238,7 +238,7 @@ class Tracker:
 
 
 def _moved_by(first: Frame, now: Frame) -> Float[np.ndarray, "4 4"]:
-    """T_now_first between the cameras of two frames: the identity where either does not know its place."""
+    """T_now_first between the cameras of two frames: the identity if either pose is unknown."""
     if first.T_world_camera is None or now.T_world_camera is None:
         return np.eye(4)
     return np.linalg.inv(now.T_world_camera) @ first.T_world_camera
@@ -255,7 +255,7 @@ def _direction(cube: ObjectFrame) -> Float[np.ndarray, "3"]:
 
 
 def _with_view(kept: tuple[_Kept, ...], new: _Kept, config: TrackConfig) -> tuple[_Kept, ...]:
-    """The views with a further one: in place of the nearest where that is near, or where there are enough."""
+    """The views with a further one: in place of the nearest one if that is near, or if there are enough."""
     cosine = [float(k.direction @ new.direction) for k in kept]
     nearest = int(np.argmax(cosine))
     if len(kept) >= config.views or cosine[nearest] > np.cos(np.radians(config.apart)):

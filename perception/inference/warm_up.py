@@ -1,4 +1,4 @@
-"""Before a camera is opened: compile what its first frame would wait for, and keep the garbage collector short."""
+"""Before a camera is opened: compile the programs of the first frame, and keep the garbage collector's pauses short."""
 
 import gc
 from dataclasses import replace
@@ -22,7 +22,7 @@ def warm_up(tracker: Tracker) -> None:
     stood before it, for which inference climbs, and half hidden, as it is there, for which it begins at the prior. It
     is a rehearsal: programs that are kept (`probnerf.compile_cache`) are read, or compiled, and not run.
 
-    Raises KeyboardInterrupt where Ctrl-C ended it, which the sampler may keep for itself.
+    Raises KeyboardInterrupt if Ctrl-C ended it, which the sampler may keep for itself.
 
     A full garbage collection stops every thread. Over what JAX keeps of its programs it takes 0.1 to 0.3 s, several
     periods of a camera, so what is there by then is set aside from it.

@@ -1,4 +1,4 @@
-"""Objects' pixels in colour alone: in a box that somebody drew, or by what a picture of the empty scene lacks."""
+"""Object pixels from colour alone: in the user's box, or as the difference from a picture of the empty scene."""
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ def label_colour(frame: Frame, config: MaskConfig) -> Int32[np.ndarray, "h w"]:
 
     With a box, 2.. are the boxes of what may stand before it.
 
-    Raises `ValueError` or `FileNotFoundError` where there is none of the three, or nothing is found.
+    Raises `ValueError` or `FileNotFoundError` if there is none of the three, or nothing is found.
     """
     if config.box_px is not None:
         label = _in_box(frame.rgb, config.box_px, config).astype(np.int32)
@@ -34,7 +34,7 @@ def label_colour(frame: Frame, config: MaskConfig) -> Int32[np.ndarray, "h w"]:
     if frame.label is not None:
         return frame.label
     raise ValueError(
-        "without depth nothing tells the object's pixels: give a box about it (--box X0 Y0 X1 Y1), a picture of the"
+        "without depth the object's pixels are unknown: give a box about it (--box X0 Y0 X1 Y1), a picture of the"
         " empty scene (segment.mask.background in the configuration), or a label map"
     )
 
@@ -76,7 +76,7 @@ def changed(
 def _in_box(
     rgb: UInt8[np.ndarray, "h w 3"], box_px: tuple[int, int, int, int], config: MaskConfig
 ) -> Bool[np.ndarray, "h w"]:
-    """The object in a box. `ValueError` where the box is no good."""
+    """The object in a box. Raises `ValueError` if the box is unusable."""
     height, width = rgb.shape[:2]
     x0, y0, x1, y1 = box_px
     name = f"the box {x0} {y0} {x1} {y1}"
@@ -90,11 +90,11 @@ def _in_box(
     inside[y0:y1, x0:x1] = True
     mask = _object_in(rgb, inside, config)
     if mask.sum() < config.least:
-        raise ValueError(f"{name} shows no object of {config.least} px unlike what surrounds it; draw it anew")
+        raise ValueError(f"{name} shows no object of {config.least} px unlike its surroundings; draw it again")
     outline = mask & ~ndimage.binary_erosion(mask, _SQUARE, border_value=1)
     edge = inside & ~ndimage.binary_erosion(inside, _SQUARE, border_value=1)
     if (outline & edge).sum() > 0.1 * outline.sum():
-        raise ValueError(f"{name} cuts the object off, or the object looks like what surrounds it; draw it larger")
+        raise ValueError(f"{name} cuts the object off, or the object looks like its surroundings; draw it larger")
     return mask
 
 

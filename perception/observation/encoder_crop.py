@@ -1,4 +1,4 @@
-"""The picture that the encoder is asked about, cut out of a frame."""
+"""The encoder's input picture, cut out of a frame."""
 
 import numpy as np
 

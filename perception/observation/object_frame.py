@@ -53,7 +53,7 @@ class ObjectFrame:
 def object_frame(frame: Frame, segment: Segment, config: ObjectFrameConfig) -> ObjectFrame:
     """The cube about a segment's object: from its visible points or, without depth, from its outline.
 
-    Raises `ValueError` where they are too few, or the object's size is out of range.
+    Raises `ValueError` if they are too few, or the object's size is out of range.
     """
     hidden = _beside_the_unseen(segment, config.outline_px)
     outline = segment.mask & ~ndimage.binary_erosion(segment.mask, border_value=0)
@@ -81,7 +81,7 @@ def _object_points(
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
     """Measured points of the object above the plane (camera frame, m), about 10,000 at most, and which are `hidden`.
 
-    Raises ValueError where there are fewer than ten.
+    Raises ValueError if there are fewer than ten.
     """
     (box,) = ndimage.find_objects(segment.mask.astype(np.int8))  # all of the object is in it
     points, mask = backproject(frame)[box], segment.mask[box]

@@ -43,7 +43,7 @@ def observe(
     `occluder_rays` UNKNOWN pixels with the range up to which they are empty, less two sigma. Each group is well spread
     over its pixels and filled up with padding, which says nothing. Deterministic in `seed`.
 
-    Raises `ValueError` where the object is outside the tabletop's range of sizes.
+    Raises `ValueError` if the object is outside the tabletop's range of sizes.
     """
     config = config or ObserveConfig()
     cube = cube or object_frame(frame, segment, config)

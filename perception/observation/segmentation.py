@@ -45,7 +45,7 @@ def segment(frame: Frame, object_id: int | None = None, config: SegmentConfig | 
     Without depth FREE is all that is not in the mask or next to it, save other masks that may be of things before the
     object: what is in no mask is taken to be behind.
 
-    Raises `ValueError` where there is no plane, no such id, or a mask of a few pixels. Without `object_id` masks that
+    Raises `ValueError` if there is no plane, no such id, or a mask of a few pixels. Without `object_id` masks that
     are too small are passed over, unless none is left.
     """
     config = config or SegmentConfig()
@@ -124,8 +124,8 @@ def _may_stand_before(
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels of other things that may hide an object: their lowest visible point is nearer on the plane than its back.
 
-    Its back is as far behind its foot as it is wide: sin(alpha) = R / D for half its width (`monocular`). What hides a
-    foot is nearer than what shows above it, so that this holds of hidden feet, too.
+    Its back is as far behind its foot as it is wide: sin(alpha) = R / D for half its width (`monocular`). The foot of a
+    thing is nearer than the part that shows above it, so this also holds for hidden feet.
     """
     own = label == object_id
     lowest = float(np.nanpercentile(slope[own], 99.5))
@@ -157,7 +157,7 @@ def _standing(
     on_plane: Bool[np.ndarray, "h w"],
     config: SegmentConfig,
 ) -> list[Bool[np.ndarray, "h w"]]:
-    """Masks of the things that stand on the plane, the largest first. Raises `ValueError` where there is none."""
+    """Masks of the things that stand on the plane, the largest first. Raises `ValueError` if there is none."""
     # The table is the largest patch of the plane, whose extension may graze a chair or a shelf.
     patch = _groups(points[on_plane] @ horizontal(plane).T, 0.02)
     table = points[on_plane][patch == np.bincount(patch).argmax()][::7]
@@ -236,7 +236,7 @@ def _unstack(
         upper = height > level + 0.006 + config.base
         if level < config.lifted or upper.sum() < config.min_cluster_pixels:
             continue
-        # It stands over the face, and not beside it in front of nothing: its outline does not go on below.
+        # It must stand over the face, not beside it: its outline does not continue below.
         carried = over(cloud[upper], plane, cloud[np.abs(height - level) < 0.006]).mean() > 0.5
         beneath = cKDTree(flat[height < level - 0.006]).query(flat[upper & (height < level + 0.03)])[0] < config.voxel
         tall = height.max() > level + config.min_height

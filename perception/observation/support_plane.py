@@ -26,7 +26,7 @@ def support_plane(
     to its inliers by total least squares. The most pixels win, where a plane that leans away from the picture's upward
     direction (a wall) counts a quarter, and one with nothing standing on it (the floor, a box's top) a tenth. What may
     stand on it is whatever the label map numbers, or without one any point that is a little higher.
-    Raises `ValueError` where no plane holds a twentieth of the points.
+    Raises `ValueError` if no plane holds a twentieth of the points.
     """
     rng = np.random.default_rng(config.seed)
     size = np.array(points.shape[:2])

@@ -1,4 +1,4 @@
-"""Posed pictures of one object on a plate: undistorted squares, what of them is the object, and how large it is.
+"""Posed pictures of one object on a plate: undistorted squares, the object's masks, and its size.
 
 The plate frame is z up, z = 0 on the plate, metres (see calibration.turntable_pose).
 """
@@ -20,7 +20,7 @@ _PX_PER_SQUARE = 40
 
 @dataclass(frozen=True)
 class PlateMaskConfig:
-    """What tells the object from what is around it."""
+    """What separates the object from its surroundings."""
 
     lowest: float = 0.006  # m above the plate; what is lower is the plate's, as depth errs by millimetres
     contrast: float = 30.0  # of 255: a pixel that differs so much from the empty plate is the object's
@@ -76,7 +76,7 @@ def plate_points(view: Square, T_plate_camera: Float[np.ndarray, "4 4"]) -> Floa
 def mask_by_depth(
     view: Square, T_plate_camera: Float[np.ndarray, "4 4"], board: Board, config: PlateMaskConfig
 ) -> Bool[np.ndarray, "s s"]:
-    """What stands over the board, higher than `lowest`."""
+    """The pixels of things on the board that are higher than `lowest`."""
     x, y, z = np.moveaxis(plate_points(view, T_plate_camera), -1, 0)
     width, height = board.size
     with np.errstate(invalid="ignore"):
@@ -91,10 +91,10 @@ def mask_by_picture(
     empty: tuple[Square, Float[np.ndarray, "4 4"]] | None,
     config: PlateMaskConfig,
 ) -> Bool[np.ndarray, "s s"]:
-    """What differs from the empty plate.
+    """The pixels that differ from the empty plate.
 
-    `empty` is a picture of it with its T_plate_camera, from where the camera stands now: the board is turned to where
-    it is in `view`, the rest stays. None: the board as printed, on white.
+    `empty` is a picture of it with its T_plate_camera, from the present place of the camera: the board is turned to
+    where it is in `view`, the rest stays. None: the board as printed, on white.
     """
     box = (view.side, view.side)
     to_view = _plate_to_pixels(view, T_plate_camera)
@@ -126,7 +126,7 @@ def mask_by_picture(
 def bounds_by_depth(
     view: Square, T_plate_camera: Float[np.ndarray, "4 4"], mask: Bool[np.ndarray, "s s"]
 ) -> Float[np.ndarray, "2 3"]:
-    """Lowest and highest x, y, z (m, plate frame) of what one view shows of the object."""
+    """Lowest and highest x, y, z (m, plate frame) of the object's visible part in one view."""
     points = plate_points(view, T_plate_camera)[mask]
     points = points[np.isfinite(points[:, 2])]
     if not len(points):
@@ -143,7 +143,7 @@ def bounds_by_carving(
 ) -> Float[np.ndarray, "2 3"]:
     """Lowest and highest x, y, z (m, plate frame) of the visual hull: what `share` of the masks allow.
 
-    From cameras above, a flat top looks pointed: the height is too large then. Raises ValueError where nothing is left.
+    From cameras above, a flat top looks pointed: the height is too large then. Raises ValueError if nothing is left.
     """
     reach = 0.5 * max(board.size)
     step = 2.0 * reach / _GRID

@@ -1,4 +1,4 @@
-"""Which part of an object's cube the camera saw."""
+"""The part of an object's cube that the camera saw."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -28,8 +28,8 @@ def seen_voxels(
 def answered_voxels(
     frame: Frame, segment: Segment, cube: ObjectFrame, grid: int = 64
 ) -> Bool[np.ndarray, "grid grid grid"]:
-    """Voxels that shapes need to be asked of: all but those at least two voxels before a measured end and two voxels
-    from any that are not. That space is free whatever a shape says.
+    """Voxels at which shapes must be evaluated: all except those at least two voxels before a measured end and two
+    voxels from any other. That space is free for every shape.
     """
     rest = ~(_behind_the_end(frame, segment, cube, grid) <= -4.0 / grid * cube.half_extent)
     return rest | ndimage.binary_dilation(rest & above_plane(grid), iterations=2)
@@ -38,7 +38,7 @@ def answered_voxels(
 def _behind_the_end(
     frame: Frame, segment: Segment, cube: ObjectFrame, grid: int
 ) -> Float[np.ndarray, "grid grid grid"]:
-    """How far each voxel's centre lies behind the end of its ray, m; NaN where that is not known."""
+    """How far each voxel's centre lies behind the end of its ray, m; NaN if unknown."""
     points, pixels, inside = _voxels(frame.camera, cube, grid)
     depth = plane_depth(frame.camera, cube.plane, segment.status) if frame.depth is None else frame.depth
     z = depth[pixels[:, 1], pixels[:, 0]]

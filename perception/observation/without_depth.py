@@ -19,7 +19,7 @@ from probnerf.types import FREE
 _ROUND, _ANGULAR = (0.03, 0.0, 0.0), (0.30, 0.06, 0.12)
 _NOT_ROUND = 0.07  # rms deviation of the foot's outline from an arc, of its radius; cartons: more, others: less
 _STEEPEST = 4.0  # slope of the nearest point of the foot (76 degrees), beyond which a picture shows no height
-_MOST = 0.5  # relative error of the distance that still is a guess
+_MOST = 0.5  # largest relative error of the distance that counts as a guess
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class StandingBody:
 
 
 def supposed_plane(frame: Frame, guess: PlaneGuess) -> Float[np.ndarray, "4"]:
-    """The support plane (n, d) in the camera frame (m). Raises `ValueError` where nothing tells it."""
+    """The support plane (n, d) in the camera frame (m). Raises `ValueError` if nothing tells it."""
     if guess.camera_height is not None and guess.tilt is not None:
         tilt = np.radians(guess.tilt)
         return np.array([0.0, -np.cos(tilt), -np.sin(tilt), guess.camera_height])
@@ -47,7 +47,9 @@ def supposed_plane(frame: Frame, guess: PlaneGuess) -> Float[np.ndarray, "4"]:
         )
     height = float(frame.T_world_camera[2, 3]) - guess.table
     if not height > 0:
-        raise ValueError(f"the camera is {-height:g} m under the table at {guess.table:g} m; mend segment.guess.table")
+        raise ValueError(
+            f"the camera is {-height:g} m under the table at {guess.table:g} m; correct segment.guess.table"
+        )
     return np.append(frame.T_world_camera[2, :3], height)
 
 
@@ -90,7 +92,7 @@ def standing_body(
     scaling about the camera, which no pixel tells. `sight_sigma` is its standard deviation.
 
     Where the foot's outline is no arc, the body is none of revolution: only its width is seen, hardly its depth.
-    Raises `ValueError` where the foot is hidden or above the horizon, or seen too steeply or too flatly.
+    Raises `ValueError` if the foot is hidden or above the horizon, or seen too steeply or too flatly.
     """
     up, h = plane[:3], float(plane[3])
     v, u = np.nonzero(mask)
@@ -111,11 +113,15 @@ def standing_body(
     top, bottom = (float(np.median(end)) for end in _ends(slope[central], phi[central], 7))
     at_bottom = central & (slope > bottom - 0.1 * (bottom - top))
     if covered[at_bottom].mean() > 0.5:
-        raise ValueError("its foot is hidden or cut off, and without depth only the foot tells its place: show it")
+        raise ValueError(
+            "its foot is hidden or cut off, and without depth its place is known from the foot alone: show the foot"
+        )
     if bottom > _STEEPEST:
-        raise ValueError("it is seen from straight above, which without depth shows no height: tilt the camera")
+        raise ValueError(
+            "it is seen from straight above, and without depth this view does not show its height: tilt the camera"
+        )
     if not bottom > 0:
-        raise ValueError("its foot is above the horizon: mend the camera's height and tilt, or its pose")
+        raise ValueError("its foot is above the horizon: correct the camera's height and tilt, or its pose")
     foot = alpha
     for _ in range(4):
         D = h / bottom / (1.0 - np.sin(foot))

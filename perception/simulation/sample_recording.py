@@ -1,8 +1,8 @@
-"""The recording that ships with the project, and how it is made.
+"""The recording that ships with the project, and how to make it.
 
 `python -m perception.simulation.sample_recording` writes it again.
 
-A mug with its handle turned away from the camera, so that no pixel tells where the handle is, and a low carton that
+A mug with its handle turned away from the camera, so that no pixel shows where the handle is, and a low carton that
 hides the mug's lower corner. No label map: the objects are found as in any recording.
 """
 

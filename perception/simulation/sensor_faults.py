@@ -1,4 +1,4 @@
-"""What a depth camera makes of a faultless picture: noise, holes, flying pixels, quantised depth."""
+"""A depth camera's faults, added to a faultless picture: noise, holes, flying pixels, quantised depth."""
 
 from dataclasses import dataclass
 
@@ -37,7 +37,7 @@ def simulate(
     config: SensorConfig | None = None,
     stamp_ns: int = 0,
 ) -> Frame:
-    """One frame of a scene with the sensor's faults and the true label map; a function of its arguments alone."""
+    """One frame of a scene with the sensor's faults and the true label map. It depends on its arguments alone."""
     return sense(render(scene, camera, T_world_camera), camera, T_world_camera, seed, config, stamp_ns)
 
 
@@ -49,7 +49,7 @@ def sense(
     config: SensorConfig | None = None,
     stamp_ns: int = 0,
 ) -> Frame:
-    """The frame that a faulty sensor makes of a picture."""
+    """A faultless picture as a frame of a faulty sensor."""
     config = config or SensorConfig()
     rng = np.random.default_rng([seed, 5])
     shape = picture.depth.shape

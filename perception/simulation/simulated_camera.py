@@ -63,7 +63,7 @@ class TableScene:
 
 @dataclass(frozen=True, eq=False)
 class FaultlessImage:
-    """What a faultless camera sees."""
+    """The picture of a faultless camera."""
 
     rgb: Float[np.ndarray, "h w 3"]  # in [0, 1]
     depth: Float[np.ndarray, "h w"]  # m along z, through the pixel's centre; inf where there is nothing

@@ -1,4 +1,4 @@
-"""Frame, the one type that every source gives, and the protocol of a source."""
+"""Frame, the type that every source yields, and the protocol of a source."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
@@ -17,7 +17,7 @@ class Frame:
     """One picture with its camera. Colour, depth and label share pixels.
 
     `camera` may be given as its 3x3 matrix K (px; pixel centres at whole numbers), for a lens without distortion.
-    Raises `ValueError` where sizes or types do not fit.
+    Raises `ValueError` if sizes or types do not fit.
     """
 
     rgb: UInt8[np.ndarray, "h w 3"]
@@ -61,10 +61,10 @@ class Frame:
 
 
 def known_counts(counts: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
-    """Depth counts with 0 in place of 65535, which in 16 bits is no distance.
+    """Depth counts with 0 in place of 65535, which in 16 bits is not a distance.
 
-    Some drivers write it where depth is unknown (time-of-flight cameras, saturated pixels), and to others it is the
-    largest count, where whatever is farther is held.
+    Some drivers write it for unknown depth (time-of-flight cameras, saturated pixels). For others it is the largest
+    count, which stands for anything farther.
     """
     return np.where(counts == SATURATED, counts.dtype.type(0), counts)
 
@@ -105,7 +105,7 @@ class StillSource:
     live = False
 
     def close(self) -> None:
-        """Nothing to let go."""
+        """Nothing to release."""
 
     def __iter__(self) -> Iterator[Frame]:
         return iter(self.frames)

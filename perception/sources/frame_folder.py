@@ -146,7 +146,7 @@ def colour_to_rgb(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w 
 
 
 def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
-    """meta.json, its keys checked, and what it may leave out filled in; depth_unit_m where there is `depth`."""
+    """meta.json, its keys checked, and what it may omit filled in; depth_unit_m where there is `depth`."""
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
@@ -164,7 +164,7 @@ def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
     meta = {**optional, **dict.fromkeys(("T_world_camera", *_DEVIATIONS)), **meta}
     for key, default in optional.items():
         if isinstance(meta[key], bool) or not isinstance(meta[key], type(default)):
-            raise ValueError(f"{path}: {key} is {meta[key]!r}; give something like {default!r}, or leave it out")
+            raise ValueError(f"{path}: {key} is {meta[key]!r}; give something like {default!r}, or omit it")
     meta["camera_matrix_px"] = _numbers(path, "camera_matrix_px", meta["camera_matrix_px"], (3, 3))
     meta["distortion"] = _numbers(path, "distortion", meta["distortion"], (len(meta["distortion"]),))
     for key, shape in _DEVIATIONS.items():

@@ -68,7 +68,7 @@ class Opened:
 
 
 class Images(Protocol):
-    """Makes the images: a device, or recorded frames on the host. Everything behind it is the same."""
+    """The maker of the images: a device, or recorded frames on the host. Everything behind it is the same."""
 
     @property
     def name(self) -> str: ...
@@ -77,10 +77,10 @@ class Images(Protocol):
 
 
 class OakSource:
-    """The frames of an OAK camera, for as long as they come.
+    """The frames of an OAK camera, as long as it delivers them.
 
-    A camera that is lost (unplugged, crashed, or silent for `silence_s`) is looked for until it is back; `notes` counts
-    the losses. Raises `OSError` where it never gave a frame, `ValueError` where calibration and image do not fit.
+    A camera that is lost (unplugged, crashed, or silent for `silence_s`) is searched for until it is back; `notes`
+    counts the losses. Raises `OSError` if it never gave a frame, `ValueError` if calibration and image do not fit.
     """
 
     live = True
@@ -117,7 +117,7 @@ class OakSource:
             try:
                 yield from self._connected()
             except OSError as error:
-                if not self._received:  # it never worked: for the user to mend
+                if not self._received:  # it never worked: the user must act
                     raise
                 if self._received > before:  # else it is still away
                     self._lost += 1
@@ -195,10 +195,10 @@ class OakSource:
 
         It does where the device cropped its sensor before it scaled: the factory calibration knows of no such crop.
         """
-        told = colour.getTransformation()
-        K = np.array(told.getIntrinsicMatrix())
-        if tuple(told.getSize()) != (camera.width, camera.height) or K[0, 0] <= 1.0:
-            return camera  # nothing told
+        transformation = colour.getTransformation()
+        K = np.array(transformation.getIntrinsicMatrix())
+        if tuple(transformation.getSize()) != (camera.width, camera.height) or K[0, 0] <= 1.0:
+            return camera  # no information
         if np.abs(K - camera.K).max() <= 0.01 * camera.width:
             return camera
         self._camera_note = (
@@ -222,7 +222,7 @@ class DeviceImages:
         self._config = config or OakConfig()
 
     def find(self) -> dai.DeviceInfo:
-        """The device, in half a second. Raises `OSError` where it is not there."""
+        """The device, in half a second. Raises `OSError` if it is not there."""
         found = dai.Device.getAllAvailableDevices()
         for info in found:
             if self._id in ("", info.deviceId, info.name):
@@ -235,7 +235,7 @@ class DeviceImages:
         )
 
     def open(self) -> Opened:
-        """Start the camera's pipeline. Raises OSError in one line where there is none, or it cannot be opened."""
+        """Start the camera's pipeline. Raises OSError in one line if there is none, or it cannot be opened."""
         config, info = self._config, self.find()
         size = (config.width, config.height)
         try:

@@ -1,4 +1,4 @@
-"""The choice of a source by what names it."""
+"""The choice of a source by its name."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +51,7 @@ def open_source(path: Path | str | None, camera: Camera | None = None, topics: T
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
     from perception.sources.recording import (
-        Log,  # here, because log.py makes Frames; and a folder needs no log libraries
+        Log,  # here, because a folder needs no log libraries
     )
 
     return Log(path, camera=camera, names=topics)

@@ -1,4 +1,4 @@
-"""A recording played back: a part of it, at the pace at which it was made or as fast as it can be read."""
+"""Playback of a recording: a part of it, at its own pace or as fast as it can be read."""
 
 import math
 import threading
@@ -29,17 +29,19 @@ class Playback:
             raise ValueError(f"{log.path}: pace {pace:g} is none; give 1 for the recording's own, or 0 for the fastest")
         if not 0 <= self.start_s <= self.end_s:
             until = "on" if end_s is None else f"to {end_s:g} s"
-            raise ValueError(f"{log.path}: from {start_s:g} s {until} is no range; give seconds after its first frame")
+            raise ValueError(
+                f"{log.path}: from {start_s:g} s {until} is not a range; give seconds after its first frame"
+            )
 
         self._closed = threading.Event()
 
     @property
     def live(self) -> bool:
-        """At a pace, frames do not wait for who reads them."""
+        """Whether frames come at a pace: then they do not wait for their reader."""
         return self.pace > 0
 
     def close(self) -> None:
-        """End the iteration under way."""
+        """End the present iteration."""
         self._closed.set()
 
     @property
@@ -70,13 +72,13 @@ def open_playback(
 ) -> Source:
     """The source at `path`, with `camera` and `topics` in place of its own (see `open_source`); a log as `Playback`.
 
-    Raises ValueError where a range is asked of a source that is no log, and whatever `open_source` raises.
+    Raises ValueError if a range is asked of a source that is no log, and whatever `open_source` raises.
     """
     source = open_source(path, camera, topics)
     if isinstance(source, Log):
         return Playback(source, pace, start_s, end_s)
     if start_s or end_s is not None:
-        raise ValueError(f"{path or SHIPPED_LOG} is no recording; leave --from and --to away")
+        raise ValueError(f"{path or SHIPPED_LOG} is no recording; omit --from and --to")
     return source
 
 
@@ -90,7 +92,7 @@ def frame_at(
 ) -> tuple[Frame, list[str]]:
     """Frame `index` (-1: the last) of a source, or of a recording's range, and the source's notes until there.
 
-    Raises ValueError where there is none, and what `open_playback` raises.
+    Raises ValueError if there is none, and what `open_playback` raises.
     """
     opened = open_playback(source, start_s=start_s, end_s=end_s, camera=camera, topics=topics)
     frame, count = None, 0

@@ -1,7 +1,7 @@
-"""Frames read without ever holding up a camera: the newest for inference, every one for a recording; their pairing.
+"""Reading frames without ever delaying a camera: the newest for inference, every one for a recording.
 
-A `Reader` pulls from a source in a thread of its own. Nobody who is slow, or has stopped, holds it up: what somebody
-does not take in time is dropped for them alone, and counted.
+A `Reader` pulls from a source in a thread of its own. Slow or stopped consumers do not delay it: frames that a consumer
+does not take in time are dropped for that consumer alone, and counted.
 """
 
 import threading
@@ -15,14 +15,14 @@ from typing import Self, TypeVar
 from foundation.one_line import one_line
 from perception.sources.frame import Frame, Source
 
-_CLOSING_S = 2.0  # that a source may take to end before its thread is left behind
-_ARRIVALS = 31  # that the rate is taken over
+_CLOSING_S = 2.0  # limit of a source's end, before its thread is abandoned
+_ARRIVALS = 31  # frames over which the rate is taken
 Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
 class ReaderCounts:
-    """What a `Reader` has seen until now."""
+    """The counts of a `Reader` so far."""
 
     received: int  # frames
     rate: float  # Hz, over the last 30 frames; it falls while the source is silent
@@ -62,7 +62,7 @@ class Reader:
         self.close()
 
     def close(self) -> None:
-        """End the source and the thread. A source that does not end within two seconds is left behind, with a note."""
+        """End the source and the thread. A source that does not end within two seconds is abandoned, with a note."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -75,7 +75,7 @@ class Reader:
     def listen(self, name: str, size: int = 90) -> "Listener":
         """A consumer that gets every frame from now on (from the first, before the `with`); up to `size` may wait.
 
-        Raises `ValueError` where another listener has the name.
+        Raises `ValueError` if another listener has the name.
         """
         with self._changed:
             if name == "newest" or any(other.name == name for other in self._listeners):
@@ -98,11 +98,11 @@ class Reader:
 
     @property
     def over(self) -> bool:
-        """Nothing more will come."""
+        """Whether the source has ended."""
         return self._ended or self._closed
 
     def counts(self) -> ReaderCounts:
-        """What was seen until now; from any thread."""
+        """The counts so far; from any thread."""
         with self._changed:
             rate = 0.0
             if len(self._arrivals) > 1:
@@ -131,7 +131,7 @@ class Reader:
                     for listener in self._listeners:
                         listener._offer(frame)
                     self._changed.notify_all()
-        except Exception as error:  # whatever it is, the consumers get it
+        except Exception as error:  # of any kind: the consumers raise it
             self._error = error
         finally:
             with self._changed:
@@ -140,7 +140,7 @@ class Reader:
 
 
 class Listener:
-    """A consumer of every frame of a `Reader`. Where too many wait, those that come are dropped, and counted."""
+    """A consumer of every frame of a `Reader`. If too many wait, new ones are dropped, and counted."""
 
     def __init__(self, reader: Reader, name: str, size: int) -> None:
         if size < 1:
@@ -177,7 +177,7 @@ class Listener:
             yield frame
 
     def close(self) -> None:
-        """Listen no longer; what waits is let go."""
+        """Stop listening; waiting frames are dropped."""
         with self._reader._changed:
             self._closed = True
             self._waiting.clear()

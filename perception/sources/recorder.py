@@ -1,7 +1,7 @@
-"""Recording: frames, and what was made of them, into one MCAP file that `Log`, rosbags, ROS 2 and Foxglove read.
+"""Recording: frames and the results of inference in one MCAP file that `Log`, rosbags, ROS 2 and Foxglove read.
 
-A thread encodes and writes, so that whoever hands over a frame waits for no disk. What is written goes to the system in
-whole chunks, at least every `flush_s`: a process that is killed loses no more than that, and `Log` reads the rest.
+A thread encodes and writes, so that the caller does not wait for the disk. Data go to the system in whole chunks, at
+least every `flush_s`: a killed process loses no more than that, and `Log` reads the rest.
 """
 
 import queue
@@ -52,7 +52,7 @@ class Recorder:
     `frames` and `bytes` tell what was written and `dropped` how many frames were not, because the writer was behind
     (never with `wait`, which lets `write_frame` wait instead). When writing fails, on a full disk say, `error` becomes
     one line, `on_error` is called with it (by the writer's thread), and whatever is handed over later is ignored; what
-    was written before can be read. Raises OSError in one line where the file is there already or cannot be made.
+    was written before can be read. Raises OSError in one line if the file is there already or cannot be made.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Recorder:
     def write_frame(self, frame: Frame) -> bool:
         """Hand over a frame, whose arrays must not change afterwards; False where it was dropped.
 
-        Camera deviations have no place in ROS messages. Raises ValueError where a label does not fit 16 bits.
+        Camera deviations have no place in ROS messages. Raises ValueError if a label does not fit 16 bits.
         """
         if frame.label is not None:
             low, high = int(frame.label.min()), int(frame.label.max())
@@ -124,7 +124,7 @@ class Recorder:
         self.write_raw(SCHEDULE_TOPIC, _STRING, _definition(_STRING), data, entry.stamp_ns)
 
     def close(self) -> None:
-        """Write what waits, then the index and the footer; what comes later is ignored. A second call does nothing."""
+        """Write what waits, then the index and the footer; later calls are ignored. A second call does nothing."""
         if not self._closed:
             self._closed = True
             self._queue.put(None)
@@ -133,7 +133,7 @@ class Recorder:
     def _hand_over(self, item: Frame | _Raw, wait: bool) -> bool:
         while self.error is None and not self._closed:
             try:
-                self._queue.put(item, block=wait, timeout=0.5)  # looks up now and then, for another thread may close
+                self._queue.put(item, block=wait, timeout=0.5)  # checks regularly whether another thread has closed it
                 return True
             except queue.Full:
                 if not wait:
@@ -164,7 +164,7 @@ class Recorder:
                     self._writer.flush()
                     due = time.monotonic() + self.config.flush_s
                 self.bytes = self._stream.tell()
-            except Exception as error:  # nothing that happens here may end the program
+            except Exception as error:  # no error here may end the program
                 self._fail(error)
         with suppress(OSError):
             self._stream.close()
@@ -194,7 +194,7 @@ def write_log(path: Path | str, frames: Iterable[Frame]) -> int:
     """Write frames to one small `.mcap` and return their number.
 
     Colour is PNG and depth whole millimetres. The file appears whole or not at all, in place of one that was there.
-    Raises `ValueError` where there is no frame or a label does not fit 16 bits, OSError where writing fails.
+    Raises `ValueError` if there is no frame or a label does not fit 16 bits, OSError where writing fails.
     """
     path = Path(path)
     small = RecordConfig(colour="png", depth="millimetres", compression="zstd", chunk_bytes=1 << 18)

@@ -111,12 +111,12 @@ class Log:
         return self._notes + self._pairing_notes
 
     def close(self) -> None:
-        """Nothing: a recording is open only while it is read."""
+        """Nothing to do: a recording is open only while it is read."""
 
     def schedule(self) -> list[Scheduled]:
-        """The inferences that the recording tells of, in the order of their frames; none where it has no schedule.
+        """The inferences in the recording's schedule, in the order of their frames; none if it has no schedule.
 
-        Raises `ValueError` where an entry cannot be read, or is of a newer version.
+        Raises `ValueError` if an entry cannot be read, or is of a newer version.
         """
         texts = [received.message.data for received in self._read({SCHEDULE_TOPIC})]
         try:
@@ -128,9 +128,9 @@ class Log:
         return self.frames()
 
     def frames(self, start_s: float = 0.0, end_s: float = np.inf) -> Iterator[Frame]:
-        """Those frames whose stamp lies from `start_s` to `end_s`, both included, after the first colour image's (s).
+        """The frames whose stamp lies from `start_s` to `end_s`, both included, after the first colour image's (s).
 
-        Raises `ValueError`, with the log's true range, where there is none.
+        Raises `ValueError`, with the log's true range, if there is none.
         """
         self._pairing_notes = []
         frames, unlabelled, first_ns, at = 0, 0, None, 0.0

@@ -1,4 +1,4 @@
-"""What image and camera_info messages hold, as arrays. Messages are read by their fields, whoever decoded them."""
+"""Image and camera_info messages as arrays. Messages are read by their fields, whichever library decoded them."""
 
 from typing import Any
 
@@ -32,7 +32,7 @@ def encoding_of(message: Any) -> str:
 
 
 def to_rgb(message: Any) -> UInt8[np.ndarray, "h w 3"]:
-    """A colour image. Raises `ValueError` where the message does not hold one."""
+    """A colour image. Raises `ValueError` if the message does not hold one."""
     image = samples(message)
     if image.dtype != np.uint8:
         raise ValueError(f"colour has {image.dtype} samples; record it with 8 bits a channel")

@@ -1,7 +1,7 @@
-"""The schedule of a recording: which frames were inferred, and all that is needed to infer the same again.
+"""The schedule of a recording: which frames were inferred, and everything needed to repeat the inference.
 
 Each inference is one std_msgs/String on `SCHEDULE_TOPIC`, which holds a JSON object: `version` and the fields of
-`Scheduled` by their names. A Farside that finds a higher version than its own refuses to follow.
+`Scheduled` by their names. A Farside that finds a higher version than its own refuses it.
 """
 
 import json
@@ -16,15 +16,15 @@ _TYPES = {"stamp_ns": int, "object_id": int, "stages": int, "seed": int}  # the 
 
 @dataclass(frozen=True)
 class Scheduled:
-    """One inference: with the frame of this stamp, it says what is to be done and what came out."""
+    """One inference: the frame of this stamp, the settings, and the result's digest."""
 
     stamp_ns: int  # of the frame
     object_id: int  # as `segment` numbers it in this frame
-    stages: int  # that the sampler was given, or got to within its budget
+    stages: int  # limit of the sampler, or reached within its budget
     seed: int
     prior_hash: str
     config_hash: str  # see `inference.schedule.config_hash`
-    digest: str  # of the hypotheses that came out; see `inference.schedule.digest`
+    digest: str  # of the resulting hypotheses; see `inference.schedule.digest`
     started_from: StartedFrom = "fresh"
 
     def to_json(self) -> str:

@@ -1,4 +1,4 @@
-"""A call that may hang, such as a device's, with a limit on its time."""
+"""A time limit for a call that may hang, such as a device's."""
 
 import threading
 from collections.abc import Callable
@@ -10,9 +10,10 @@ from perception.sources.reader import Result
 def within(
     limit_s: float, call: Callable[[], Result], complaint: str, late: Callable[[Result], object] | None = None
 ) -> Result:
-    """What `call` returns or raises; `OSError` with the complaint if it takes longer, and then it is left behind.
+    """The result of `call`, or its exception. `OSError` with the complaint if it takes longer; the call is then
+    abandoned.
 
-    What it returns after that goes to `late`, to be closed.
+    A result after that goes to `late`, to be closed.
     """
     finished: Queue[Result | Exception] = Queue()
     settled = threading.Lock()  # whoever takes it first: the waiting caller's patience, or the result

@@ -1,4 +1,4 @@
-"""Names of topics: which are meant, and what the words of a name say of its images. Standard library only."""
+"""Names of topics: which are chosen, and what the words of a name say about its images. Standard library only."""
 
 import re
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ def is_rectified(topic: str) -> bool:
 
 
 def named_otherwise(topic: str) -> str | None:
-    """The part of a topic's name that says that its images are no depth."""
+    """The part of a topic's name that says that its images are not depth."""
     return next(iter(sorted(NO_DEPTH_PARTS & name_parts(topic))), None)
 
 
 @dataclass(frozen=True)
 class TopicNames:
-    """Topics of a recording that are given by name; None: the one that is found."""
+    """Topics of a recording that the user names; None: found automatically."""
 
     colour: str | None = None
-    depth: str | None = None  # taken as aligned to colour, whatever its frame_id
+    depth: str | None = None  # counts as aligned to colour, whatever its frame_id

@@ -42,19 +42,19 @@ def frame_of(message: Any) -> str:
 
 
 def other_camera(info: Any, colour: Any) -> str | None:
-    """The words that tell of a camera_info of another camera than the image's; None where frame_id does not differ."""
+    """Words for a camera_info of another camera than the image's; None if frame_id does not differ."""
     a, b = frame_of(info), frame_of(colour)
     return f"is of frame {a!r} but colour is of frame {b!r}, so it is another camera's" if a and b and a != b else None
 
 
 def not_aligned(depth: Any, colour: Any) -> str | None:
-    """The words that tell of depth of another camera than colour's; None where frame_id does not differ."""
+    """Words for depth of another camera than colour's; None if frame_id does not differ."""
     a, b = frame_of(depth), frame_of(colour)
     return f"is of frame {a!r} but colour is of frame {b!r}, so it is not aligned" if a and b and a != b else None
 
 
 def doubt(depth: Float32[np.ndarray, "h w"]) -> str | None:
-    """What tells that an image is no depth in metres (0 or NaN where unknown); None where nothing does."""
+    """The reason why an image cannot be depth in metres (0 or NaN where unknown); None if there is no such reason."""
     values = depth[np.isfinite(depth) & (depth != 0)]
     if not values.size:
         return None
@@ -67,7 +67,7 @@ def doubt(depth: Float32[np.ndarray, "h w"]) -> str | None:
 
 
 def colour_topic(path: Path, firsts: Mapping[str, Any], name: str | None = None) -> tuple[str, list[str]]:
-    """The colour among topics, each with its first image, and notes. Raises ValueError where there is none.
+    """The colour among topics, each with its first image, and notes. Raises ValueError if there is none.
 
     `name` is the topic that was asked for.
     """
@@ -93,7 +93,7 @@ def colour_topic(path: Path, firsts: Mapping[str, Any], name: str | None = None)
 def choose(path: Path, images: Mapping[str, Any], infos: Mapping[str, Any], names: TopicNames) -> Chosen:
     """The topics of one camera among those of a recording, each given with its first message.
 
-    Raises ValueError, with the topic and the remedy, where there is no colour, or where depth or camera_info is another
+    Raises ValueError, with the topic and the remedy, if there is no colour, or if depth or camera_info is another
     camera's.
     """
     colour, notes = colour_topic(path, images, names.colour)
@@ -148,7 +148,7 @@ def _depth_topic(path: Path, images: Mapping[str, Any], colour: str, name: str |
 
 def _named_depth(path: Path, images: Mapping[str, Any]) -> tuple[list[str], list[str]]:
     """The topics whose name or transport says depth, and notes on those that might be."""
-    found, unsaid = [], []
+    found, unnamed = [], []
     for topic, message in images.items():
         parts, encoding = name_parts(topic), encoding_of(message)
         if encoding not in ("16UC1", "mono16", "32FC1") or parts & (_LABEL_PARTS | NO_DEPTH_PARTS):
@@ -156,11 +156,11 @@ def _named_depth(path: Path, images: Mapping[str, Any]) -> tuple[list[str], list
         if "depth" in parts or "compressedDepth" in getattr(message, "format", ""):
             found.append(topic)
         elif encoding != "mono16" and not parts & _INFRARED_PARTS:
-            unsaid.append(f"{topic} ({encoding})")
-    if found or not unsaid:
+            unnamed.append(f"{topic} ({encoding})")
+    if found or not unnamed:
         return found, []
-    said = f"{path.name}: {', '.join(unsaid)} may be depth, but no part of the name says depth, so it is not used"
-    return found, [f"{said}; if it is, choose it with --depth-topic"]
+    note = f"{path.name}: {', '.join(unnamed)} may be depth, but no part of the name says depth, so it is not used"
+    return found, [f"{note}; if it is, choose it with --depth-topic"]
 
 
 def _info_topic(path: Path, infos: Mapping[str, Any], images: Mapping[str, Any], colour: str) -> str | None:

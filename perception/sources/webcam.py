@@ -1,4 +1,4 @@
-"""Colour alone, through OpenCV: a camera by its number, and video files."""
+"""Colour alone, through OpenCV: cameras by number, and video files."""
 
 import os
 import sys
@@ -22,7 +22,7 @@ _GUESSED_CENTRE_STD = 0.05  # of the width
 
 
 def guessed_camera(width: int, height: int) -> Camera:
-    """A camera for pictures (px) of which nothing is known: 60 degrees across, no distortion, wide deviations."""
+    """A camera for pictures (px) of an unknown lens: 60 degrees across, no distortion, wide deviations."""
     focal = 0.5 * width / np.tan(np.radians(0.5 * _GUESSED_FOV))
     K = np.array([[focal, 0.0, 0.5 * (width - 1)], [0.0, focal, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
     focal_std, centre_std = _GUESSED_FOCAL_STD * focal, _GUESSED_CENTRE_STD * width
@@ -31,10 +31,10 @@ def guessed_camera(width: int, height: int) -> Camera:
 
 
 class _Pictures:
-    """What a camera and a file share: the calibration, which must be of the pictures' size, or a guess with a note.
+    """Common part of a camera and a file: the calibration, which must fit the pictures' size, or a guess with a note.
 
-    A calibration at another size is refused and never scaled: a camera may crop its sensor instead of scaling, and
-    nothing in the picture tells which.
+    A calibration at another size is refused and never scaled: a camera may crop its sensor instead of scaling, and the
+    picture does not tell which.
     """
 
     def __init__(self, name: str, camera: Camera | None) -> None:
@@ -71,10 +71,10 @@ class _Pictures:
 
 
 class Webcam(_Pictures):
-    """The camera /dev/videoN. It is asked for the size of its calibration, where one is given.
+    """The camera /dev/videoN. It is set to the size of its calibration, if there is one.
 
     A stamp is the time at which the picture reached this computer (UNIX ns); it was exposed some time before. Raises
-    `ValueError` where `number` is none and `OSError`, one line, where the camera is absent, in use, or lost.
+    `ValueError` for an invalid `number` and `OSError`, one line, if the camera is absent, in use, or lost.
     """
 
     live = True
@@ -121,7 +121,7 @@ class Webcam(_Pictures):
 class VideoFile(_Pictures):
     """A video file; stamps are its media time (ns from its start), and frames come as fast as they are read.
 
-    Raises `FileNotFoundError` or `ValueError`, one line, where it is absent or nothing in it can be decoded.
+    Raises `FileNotFoundError` or `ValueError`, one line, if it is absent or cannot be decoded.
     """
 
     live = False
@@ -139,7 +139,7 @@ class VideoFile(_Pictures):
             raise ValueError(f"{path} holds no picture; give a video file")
 
     def close(self) -> None:
-        """Nothing: a file is open only while it is read."""
+        """Nothing to do: a file is open only while it is read."""
 
     def __iter__(self) -> Iterator[Frame]:
         self._missing = []
@@ -172,7 +172,7 @@ class VideoFile(_Pictures):
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep OpenCV's own warnings off the terminal: what fails is said once, by an exception."""
+    """Keep OpenCV's own warnings off the terminal: failures are reported once, by an exception."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:

@@ -68,9 +68,9 @@ def call(
         "colour_sigma": likelihood.colour_sigma,
         "per_density": 1.0 / likelihood.lattice.cubes,
     }
-    given = (weights, pose, observation.rays.origin, observation.rays.direction, t, *pixels)
+    inputs = (weights, pose, observation.rays.origin, observation.rays.direction, t, *pixels)
     values, g_weights, g_pose = operation(
-        *(a.astype(jnp.float32) for a in given),
+        *(a.astype(jnp.float32) for a in inputs),
         *flags,
         **{name: np.float32(value) for name, value in numbers.items()},
         colour_count=np.int32(observation.colour_count),
@@ -102,8 +102,8 @@ def density(
     What is outside the window costs nothing. The answer does not depend on the number of threads.
     """
     found = jax.ShapeDtypeStruct((weights.shape[0], points.shape[0]), jnp.float32)
-    given = (a.astype(jnp.float32) for a in (weights, pose, points))
-    return jax.ffi.ffi_call(DENSITY, found)(*given, **_how(field, threads, isa))
+    inputs = (a.astype(jnp.float32) for a in (weights, pose, points))
+    return jax.ffi.ffi_call(DENSITY, found)(*inputs, **_how(field, threads, isa))
 
 
 def _forward(field, likelihood, observation, t, weights, pose, pixel_weight):

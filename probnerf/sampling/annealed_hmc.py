@@ -78,8 +78,8 @@ def annealed_hmc(
                 base = min(base, MAX_ANNEALED_STEP / config.s_start)
             if on_stage is not None:
                 none, seconds = (float("nan"),), time.monotonic() - begun
-                told = StageInfo(t, (beta,), none, (acceptances[-1],), (step,), none, divergences, seconds, samples)
-                if on_stage(told):
+                progress = StageInfo(t, (beta,), none, (acceptances[-1],), (step,), none, divergences, seconds, samples)
+                if on_stage(progress):
                     result = StopReason.STOPPED
                     break
     except KeyboardInterrupt:

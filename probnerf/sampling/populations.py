@@ -139,7 +139,7 @@ def start_from(before: Posterior, populations: int) -> tuple[Float[Array, "m n d
     """The samples of tempered SMC as starts of another run: positions per population, and log-densities there.
 
     By each population's own estimate of its evidence, so that the estimates go on from where they were, and populations
-    keep their shares. Where there were more than `populations`, several stand together as one. Raises ValueError where
+    keep their shares. Where there were more than `populations`, several stand together as one. Raises ValueError if
     they do not divide.
     """
     m, size = len(before.diagnostics.beta), before.positions.shape[-1]

@@ -31,7 +31,7 @@ _LINES = ("f cx cy 0", "barycentre", "scale", "height width")
 
 @dataclass(frozen=True, eq=False)
 class Instance:
-    """One object's pictures, V of H x W pixels, as the files have them. Raises ValueError where they cannot be."""
+    """One object's pictures, V of H x W pixels, as the files have them. Raises ValueError if they cannot be."""
 
     name: str
     focal: float  # px
@@ -103,7 +103,7 @@ def write_instance(root: Path, instance: Instance) -> Path:
 
 
 def find_instances(root: Path) -> list[Path]:
-    """Folders of the instances in `root`, which may be one itself. Raises FileNotFoundError where there is none."""
+    """Folders of the instances in `root`, which may be one itself. Raises FileNotFoundError if there is none."""
     root = Path(root)
     if (root / "intrinsics.txt").is_file():
         return [root]

@@ -72,7 +72,7 @@ def test_a_turn_becomes_a_data_set(run: Callable[..., int], tmp_path: Path, caps
     assert blue.any(axis=(1, 2)).all() and (red | green).any(axis=(1, 2)).all()
     said = plain(capsys.readouterr().out)
     assert "6 of 6" in said and "counter-clockwise from above" in said
-    assert "mm from the board's centre" in said and "degrees off what was asked for" in said
+    assert "mm from the board's centre" in said and "degrees from the commanded turns" in said
     sides = re.search(r"(\d+) x (\d+) x (\d+) mm", said)
     assert sides is not None
     np.testing.assert_allclose([int(n) for n in sides.groups()], 1000 * (HIGH - LOW), atol=5)

@@ -51,9 +51,9 @@ def test_it_keeps_the_pace(log: Log) -> None:
     [
         ((0.0, 3.0, None), "second.mcap has no frame from 3 s on; it runs from 0 to 1.000 s"),
         ((0.0, 0.01, 0.02), "has no frame from 0.01 s to 0.02 s; it runs from 0 to 1.000 s"),
-        ((0.0, -1.0, None), "from -1 s on is no range"),
-        ((0.0, 0.5, 0.2), "from 0.5 s to 0.2 s is no range"),
-        ((0.0, float("nan"), None), "from nan s on is no range"),
+        ((0.0, -1.0, None), "from -1 s on is not a range"),
+        ((0.0, 0.5, 0.2), "from 0.5 s to 0.2 s is not a range"),
+        ((0.0, float("nan"), None), "from nan s on is not a range"),
         ((-1.0, 0.0, None), "pace -1 is none; give 1 for the recording's own"),
         ((float("inf"), 0.0, None), "pace inf is none"),
     ],
@@ -68,5 +68,5 @@ def test_only_a_recording_has_a_range(log: Log, tmp_path: Path) -> None:
     assert numbers(list(open_playback(log.path, end_s=0.1))) == [0, 1, 2, 3]
     folder = write_folder(tmp_path / "table", frame(0))
     assert isinstance(open_playback(folder), StillSource)
-    with pytest.raises(ValueError, match="table is no recording; leave --from and --to away"):
+    with pytest.raises(ValueError, match="table is no recording; omit --from and --to"):
         open_playback(folder, start_s=1.0)
