@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.summary import Direction, next_view, size, sticks_out, summarise
 from perception.observation.object_frame import ObjectFrame
@@ -44,7 +45,7 @@ def bodies(parts: list[list[tuple]], weights: list[float], x: float = 0.0, **cha
         "monte_carlo_error": 0.01,
         "prior_hash": "",
         "seed": 0,
-        "diagnostics": {},
+        "diagnostics": AnswerDiagnostics(),
         "result": "converged",
     }
     return Hypotheses(**{**fields, **changes})
