@@ -24,7 +24,6 @@ SHOWN = 4  # hypotheses in a picture
 _ROWS = 6  # of the summary
 _PIXELS = 180  # of a small picture's side
 _LOG2 = float(np.log(2.0))
-_CURVES = {"loss": "loss (nats per object)", "fit": "fit (nats per object)", "kl": "KL (nats)"}
 _DISAGREEMENT, _OCCUPIED = "RdPu", "OrRd"
 
 

@@ -12,7 +12,7 @@ from probnerf.fields.base import Field, Model
 from probnerf.likelihood.position import range_offset_of, split_position
 from probnerf.likelihood.settings import Likelihood
 from probnerf.rendering import foam
-from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
+from probnerf.types import FREE, OBJECT, Observation, Pose
 
 
 @program(rehearse=False)
@@ -127,8 +127,3 @@ def pixel_terms(
 def mean_colour(premultiplied: Float[Array, "n 3"], opacity: Float[Array, "n 1"]) -> Float[Array, "n 3"]:
     """Sum w_i c_i / O: a pixel's expected colour given a hit; grey where nothing is hit."""
     return (premultiplied + 0.5e-3) / (opacity + 1e-3)
-
-
-def empty_observation_rays(count: int) -> Rays:
-    """Padding rays: they start outside the lattice and point away from it."""
-    return Rays(origin=jnp.full((count, 3), 50.0), direction=jnp.broadcast_to(jnp.array([1.0, 0.0, 0.0]), (count, 3)))

@@ -42,15 +42,6 @@ def voxel_index(points: Float[ArrayLike, "... 3"], grid: int) -> Int[np.ndarray,
     return np.where(inside, index, -1)
 
 
-def wall_opacity(sigma: Float[ArrayLike, "..."], grid: int) -> Float[np.ndarray, "..."]:
-    """Opacity across one voxel of density `sigma`: 1 - exp(-sigma / grid).
-
-    The foam gives the face of a lattice of G cells of width 2/G the opacity 1 - exp(-sigma/G), so density accumulates
-    sigma/2 per cube unit whatever the lattice, and sigma/grid across a voxel of width 2/grid.
-    """
-    return -np.expm1(-np.asarray(sigma) / grid)
-
-
 def solid(
     opacity: Shaped[np.ndarray, "... G G G"], base: Float[ArrayLike, "..."] = BASE_Z
 ) -> Bool[np.ndarray, "... G G G"]:

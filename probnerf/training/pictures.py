@@ -6,14 +6,12 @@ A view camera looks roughly at the cube's centre, as the crop that `perception` 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 
 from probnerf.geometry import look_at, pinhole_rays
 from probnerf.objects.ray_tracer import trace_batch
 from probnerf.objects.tabletop import sample_objects
 from probnerf.prior.encoder_input import ENCODER_RADIUS
-from probnerf.types import Rays
 
 
 @dataclass(frozen=True)
@@ -72,9 +70,3 @@ def draw_views(
         if progress is not None:
             progress(min(start + block, len(seeds)), len(seeds))
     return ViewSet(seeds=np.asarray(seeds), rgb=rgb, range=ranges, T_object_camera=transforms, tan_half_fov=tangents)
-
-
-def camera_rays(T_object_camera: np.ndarray, tan_half_fov: float, size: int) -> Rays:
-    """All pixel rays of one view."""
-    origin, direction = pinhole_rays(T_object_camera, 0.5 * size / tan_half_fov, size)
-    return Rays(origin=jnp.asarray(origin), direction=jnp.asarray(direction))

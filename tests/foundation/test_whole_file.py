@@ -22,9 +22,14 @@ def test_an_error_leaves_what_was_there_and_nothing_else(tmp_path: Path, old: by
     if old is not None:
         path.write_bytes(old)
     before = list(tmp_path.iterdir())
-    with pytest.raises(KeyboardInterrupt), whole_file(path) as part:
-        part.write_bytes(b"half")
-        raise KeyboardInterrupt
+
+    def interrupted() -> None:
+        with whole_file(path) as part:
+            part.write_bytes(b"half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
     assert list(tmp_path.iterdir()) == before and (old is None or path.read_bytes() == old)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from probnerf.fields.cylinder import CylinderModel
-from probnerf.likelihood.pixel_terms import empty_observation_rays, faces_of_view, log_likelihood_one, pixel_terms
+from probnerf.likelihood.pixel_terms import faces_of_view, log_likelihood_one, pixel_terms
 from probnerf.likelihood.position import pose_of, split_position
 from probnerf.likelihood.settings import Likelihood
 from probnerf.objects.cylinder_scenes import grid_of_rays, scene
@@ -137,7 +137,9 @@ def test_a_range_offset_is_a_bias_that_all_ranges_share(rays):
 def test_padding_says_exactly_nothing():
     model, likelihood, observation, _ = scene("seen", depth=True)
     count = observation.status.shape[0]
-    padding = _says(empty_observation_rays(32), UNKNOWN)
+    # Padding: rays that start outside the lattice and point away from it.
+    away = Rays(jnp.full((32, 3), 50.0), jnp.broadcast_to(jnp.array([1.0, 0.0, 0.0]), (32, 3)))
+    padding = _says(away, UNKNOWN)
     per_ray = [replace(o, pose_sigma=o.status, colour_count=0) for o in (observation, padding)]  # the padding last
     padded = jax.tree.map(lambda *parts: jnp.concatenate(parts), *per_ray)
     padded = replace(padded, pose_sigma=observation.pose_sigma, colour_count=observation.colour_count)

@@ -10,7 +10,6 @@ from probnerf.rendering.occupancy import (
     voxel_centres,
     voxel_index,
     voxel_surface,
-    wall_opacity,
 )
 from probnerf.types import BASE_Z
 
@@ -96,12 +95,6 @@ def test_bytes_floats_and_batches_agree():
     np.testing.assert_array_equal(solid(np.rint(255 * opacity).astype(np.uint8)), solid(np.rint(255 * opacity) / 255))
     with pytest.raises(ValueError, match="last three axes"):
         solid(np.zeros((4, 4, 5)))
-
-
-def test_opacity_accumulates_alike_on_every_grid():
-    coarse, fine = wall_opacity(30.0, 16), wall_opacity(30.0, 64)
-    np.testing.assert_allclose(1 - coarse, (1 - fine) ** 4, rtol=1e-12)  # four fine voxels across a coarse one
-    np.testing.assert_allclose(wall_opacity(np.log(2.0) * 64, 64), 0.5)
 
 
 def test_voxels_hold_their_centres_and_the_cube_its_faces():
