@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+import urllib.request
 from pathlib import Path
 from subprocess import PIPE
 from typing import Any
@@ -19,13 +20,15 @@ from node.commands.options import LiveConfig
 from node.ros.bus import Bus
 from node.ros.messages import HYPOTHESES, NEXT_VIEW, QUERY_REGION, hypotheses_from, make
 from node.ros.settings import BusConfig
+from node.viewer.page import Page
+from perception.inference.tracker import Tracker, Update
 from perception.sources.recording import Log
 from perception.sources.settings import SHIPPED_LOG
 from probnerf.prior.checkpoint import save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from tests.conftest import ROOT
 from tests.node.commands.test_replay_whole import FEW
-from tests.node.shapes import free_port
+from tests.node.shapes import body_with_handle, free_port
 
 LAUNCH = ROOT / "launch"
 
@@ -51,6 +54,40 @@ def test_what_is_not_there_is_one_line(
     assert main(["live", *arguments, "--config", str(tmp_path / "live.yaml")]) == 1
     said = capsys.readouterr().err
     assert said.startswith("farside: error: ") and said.count("\n") == 1 and re.search(says, said)
+
+
+def test_a_page_shows_what_the_node_infers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """The shipped recording through reader, tracker, bus and page: hypotheses are given in place of the sampler's."""
+    shown: list[tuple[int, dict[int, str], bytes]] = []
+    port, show = free_port(), Page.show
+
+    def seen(self: Page, scene: Any, view: Any) -> None:
+        show(self, scene, view)
+        with urllib.request.urlopen(self.address, timeout=10) as answer:
+            shown.append((view.frame.stamp_ns, {h.object_id: h.result for h in scene}, answer.read()))
+
+    def infer(self: Tracker, look: Any, *, on_answer: Any, **_: Any) -> Update:
+        stamp = {"stamp_ns": look._view.frame.stamp_ns, "object_id": look.object_id}
+        on_answer(body_with_handle(**stamp, result="underway"))
+        on_answer(h := body_with_handle(**stamp))
+        return Update("new", h, 4, 0.0, 0.0)
+
+    monkeypatch.setattr("node.commands.live.warm_up", lambda _: None)
+    monkeypatch.setattr(Page, "show", seen)
+    monkeypatch.setattr(Tracker, "infer", infer)
+    save_prior(tmp_path / "tiny.safetensors", ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {})
+    (tmp_path / "live.yaml").write_text("bus: {listen: [tcp/127.0.0.1:0]}")
+    options = ["--prior", str(tmp_path / "tiny.safetensors"), "--config", str(tmp_path / "live.yaml")]
+    assert main(["live", str(SHIPPED_LOG), *options, "--page", str(port)]) == 0
+    said = capsys.readouterr()
+    assert f"http://127.0.0.1:{port} shows it" in said.out and not said.err
+    assert {stamp for stamp, _, _ in shown} <= {frame.stamp_ns for frame in Log(SHIPPED_LOG)}
+    scenes = [scene for _, scene, _ in shown[:4]]  # of the first frame: each object's first and last answer
+    first, second = "converged", "underway"
+    assert scenes == [{1: second}, {1: first}, {1: first, 2: second}, {1: first, 2: first}]
+    assert all(b"<html" in page for *_, page in shown)
 
 
 def wait_for(planner: Bus, name: str, kind: str, request: Any, seconds: float = 200.0) -> Any:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -22,7 +23,9 @@ from probnerf.fields.cylinder import CylinderModel
 from probnerf.inference import InferConfig
 from probnerf.objects.tabletop import part_distances
 from probnerf.prior.checkpoint import Prior, load_prior
-from probnerf.types import Diagnostics, Posterior
+from probnerf.prior.networks import PRESETS, ProbNeRF
+from probnerf.settings import quick_smc
+from probnerf.types import UNKNOWN, Diagnostics, Posterior
 from tests.node.mugs import CAMERA, MUG
 from tests.perception.answers.test_query import BODY, _fill, _object
 from tests.perception.cylinders import CAN, Cylinder, looking_down, picture
@@ -157,6 +160,32 @@ def test_a_plane_that_moved_says_that_the_camera_did(given: list[ConditionedView
         first, second = (picture(CAN, T=each, noise=0.0) for each in (looking_down(), T))
         assert tracker.update(first, segment(first)[0]).change == "new"
         assert tracker.update(second, segment(second)[0]).change == change
+
+
+def test_a_second_view_is_inferred_together_with_the_first() -> None:
+    """Nothing replaced but the prior, which is small and untrained: so no frame is held against what it explains."""
+    few = quick_smc(2, 4)
+    settings = InferConfig(lattice=8, smc=few, smc_from_prior=few, encoder_starts=False)
+    config = replace(QUICK, hypotheses=4, grid=16, infer=settings)
+    prior = Prior(ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {}, "x")
+    tracker = Tracker(prior, config, TrackConfig(moved_below=0.0))
+    looks, updates = [], []
+    for stamp_ns, azimuth in enumerate((0.0, 180.0)):
+        frame = frame_from(azimuth, stamp_ns=stamp_ns)
+        looks.append(tracker.look(frame, segment(frame)[0]))
+        updates.append(tracker.infer(looks[-1], stages=1))
+    first, second = updates
+    assert (first.change, second.change) == ("new", "view") and first.stages == second.stages == 1
+    assert looks[1].object_id == looks[0].object_id and looks[1].hypotheses.stamp_ns == 1
+    # both views' pixels are asked, in one cube: the first frame's, seen by the second camera
+    counts = [int((np.asarray(look._view.observation.status) != UNKNOWN).sum()) for look in looks]
+    assert counts[1] > 1.5 * counts[0]
+    at = [h.T_world_camera @ h.object_frame.T_camera_object for h in (first.hypotheses, second.hypotheses)]
+    np.testing.assert_allclose(at[0], at[1], atol=1e-9)
+    # what the first camera saw stays seen, and the second one saw more
+    assert not (first.hypotheses.seen & ~second.hypotheses.seen).any()
+    assert second.hypotheses.seen.mean() > first.hypotheses.seen.mean() + 0.05
+    assert not np.array_equal(first.hypotheses.opacity, second.hypotheses.opacity)
 
 
 @pytest.mark.slow
