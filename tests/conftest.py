@@ -2,6 +2,7 @@
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,26 @@ signal.signal(
 )  # run in the background, children would inherit its being ignored
 os.environ.setdefault("DEPTHAI_LEVEL", "error")  # its warning about a missing USB bus
 os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")  # its handlers end the process; Python raises
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """The default tests compile more than they compute: they optimise little. Slow ones run the code that users run."""
+    if config.option.markexpr == "not slow":
+        quick = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {quick}".strip()
+        os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # level 0, but for the fixture `optimised`
+
+
+@pytest.fixture
+def optimised() -> Iterator[None]:
+    """For a default test that computes for longer than it compiles, or that compares roundings."""
+    import jax  # not before its settings are made
+
+    name = "jax_disable_most_optimizations"
+    before = jax.config.values[name]
+    jax.config.update(name, False)
+    yield
+    jax.config.update(name, before)
 
 
 @pytest.fixture(scope="session")

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -88,16 +89,17 @@ print(len(jax.devices()), *np.concatenate([np.ravel(x) for x in both(args, q)]))
 
 def test_the_compiler_reduces_products_rightly():
     """Not so in jaxlib 0.10.2 on CPUs (jax-ml/jax#39103): silently wrong from some size on, hence excluded."""
+    jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True})
     rng = np.random.default_rng(0)
     scale, x = rng.random((3, 12, 55)), rng.normal(size=(1536, 12, 55))
-    found = jax.jit(lambda p, x: jax.vmap(lambda x: jnp.max(-jnp.sum(p * x**2, -1)))(x))(
+    found = jit(lambda p, x: jax.vmap(lambda x: jnp.max(-jnp.sum(p * x**2, -1)))(x))(
         scale.astype(np.float32), x.astype(np.float32)
     )
     expected = np.max(-np.einsum("pmd,nmd->npm", scale, x**2), axis=(1, 2))
     np.testing.assert_allclose(found, expected, rtol=1e-4)
     matrix = rng.normal(size=(12, 55, 55))
     image = np.einsum("mij,nmj->nmi", matrix, x)
-    found = jax.jit(
-        jax.vmap(lambda x: jnp.max(-jnp.sum(jnp.einsum("mij,mj->mi", matrix.astype(np.float32), x) ** 2, -1)))
-    )(x.astype(np.float32))
+    found = jit(jax.vmap(lambda x: jnp.max(-jnp.sum(jnp.einsum("mij,mj->mi", matrix.astype(np.float32), x) ** 2, -1))))(
+        x.astype(np.float32)
+    )
     np.testing.assert_allclose(found, np.max(-np.sum(image**2, -1), axis=1), rtol=1e-4)

@@ -142,6 +142,7 @@ def _check(posteriors: list[Posterior], grid: GridPosterior) -> None:
 
 
 @pytest.mark.parametrize(("condition", "depth"), QUICK)
+@pytest.mark.usefixtures("optimised")
 def test_tempered_smc_is_the_posterior(condition, depth):
     args, grid = _scene(condition, depth)
     _check([tempered_smc(jax.random.key(seed), log_likelihood, args, 9) for seed in (0, 1)], grid)

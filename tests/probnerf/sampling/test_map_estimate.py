@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from probnerf.fields.cylinder import CylinderModel
 from probnerf.geometry import look_at, pinhole_rays
@@ -83,6 +84,7 @@ def test_the_yaw_s_prior_is_flat():
     np.testing.assert_allclose(a, b, atol=1e-2)
 
 
+@pytest.mark.usefixtures("optimised")
 def test_a_visible_handle_s_yaw_and_the_body_s_size_are_found_again():
     yaw = 1.0
     truth = np.array([0.5, 0.4, np.cos(yaw), np.sin(yaw), 0.3, -0.4, 0.2, 0.0, 0.0], np.float32)
