@@ -68,10 +68,10 @@ def test_a_page_shows_what_the_node_infers(
         with urllib.request.urlopen(self.address, timeout=10) as answer:
             shown.append((view.frame.stamp_ns, {h.object_id: h.result for h in scene}, answer.read()))
 
-    def infer(self: Tracker, look: Any, *, on_answer: Any, **_: Any) -> Update:
+    def infer(self: Tracker, look: Any, limits: Any, callbacks: Any) -> Update:
         stamp = {"stamp_ns": look._view.frame.stamp_ns, "object_id": look.object_id}
-        on_answer(body_with_handle(**stamp, result="underway"))
-        on_answer(h := body_with_handle(**stamp))
+        callbacks.on_answer(body_with_handle(**stamp, result="underway"))
+        callbacks.on_answer(h := body_with_handle(**stamp))
         return Update("new", h, 4, 0.0, 0.0)
 
     monkeypatch.setattr("node.commands.live.warm_up", lambda _: None)

@@ -11,6 +11,7 @@ import pytest
 import perception.inference.tracker
 from perception.answers.hypotheses import Hypotheses
 from perception.inference.controller import Estimate
+from perception.inference.limits import Limits
 from perception.inference.publish import ConditionedView
 from perception.inference.settings import ControllerConfig, TrackConfig
 from perception.inference.tracker import Tracker
@@ -173,7 +174,7 @@ def test_a_second_view_is_inferred_together_with_the_first() -> None:
     for stamp_ns, azimuth in enumerate((0.0, 180.0)):
         frame = frame_from(azimuth, stamp_ns=stamp_ns)
         looks.append(tracker.look(frame, segment(frame)[0]))
-        updates.append(tracker.infer(looks[-1], stages=1))
+        updates.append(tracker.infer(looks[-1], Limits(stages=1)))
     first, second = updates
     assert (first.change, second.change) == ("new", "view") and first.stages == second.stages == 1
     assert looks[1].object_id == looks[0].object_id and looks[1].hypotheses.stamp_ns == 1
