@@ -20,7 +20,7 @@ def scheduled(h: Hypotheses, config_hash: str, started_from: StartedFrom = "fres
 
 def config_hash(*configs: Any) -> str:
     """16 hexadecimal digits that identify configurations (dataclasses) by the values of their fields."""
-    text = json.dumps([asdict(config) for config in configs], sort_keys=True)
+    text = json.dumps([asdict(config) for config in configs], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -13,7 +13,7 @@ import cv2
 import jax
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 import node.commands.replay
 from node.__main__ import main
@@ -106,10 +106,7 @@ def test_out_draws_turning_hypotheses(
     frame = read_frame_folder(results / "frame")
     draw_turning(moving, mug, frame, steps=3)
     with Image.open(moving) as picture:
-        pictures = []
-        for k in range(picture.n_frames):
-            picture.seek(k)
-            pictures.append(np.asarray(picture.convert("RGB")).astype(int))
+        pictures = [np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(picture)]
     assert len(pictures) == 3 and [p.name for p in moving.parent.iterdir()] == ["mug.gif"]
     side = pictures[0].shape[0]
     for other in pictures[1:]:

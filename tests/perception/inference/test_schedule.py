@@ -9,7 +9,7 @@ import pytest
 
 from perception.inference.schedule import config_hash, digest, scheduled
 from perception.inference.settings import ControllerConfig
-from perception.observation.settings import SegmentConfig
+from perception.observation.settings import MaskConfig, SegmentConfig
 from perception.sources.recorder import Recorder
 from perception.sources.recording import Log
 from perception.sources.schedule_entry import SCHEDULE_TOPIC, Scheduled
@@ -88,3 +88,10 @@ def test_a_configuration_is_named_by_its_values() -> None:
     assert one == config_hash(ControllerConfig(), SegmentConfig()) and len(one) == 16
     assert one != config_hash(ControllerConfig(), SegmentConfig(above=0.009))
     assert one != config_hash(ControllerConfig(hypotheses=47), SegmentConfig())
+
+
+def test_a_configuration_with_a_path_has_a_hash() -> None:
+    def of(name: str) -> str:
+        return config_hash(SegmentConfig(mask=MaskConfig(background=Path(name))))
+
+    assert of("empty.png") == of("empty.png") != of("other.png")
