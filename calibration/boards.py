@@ -78,9 +78,9 @@ class Board:
     def find(
         self, image: UInt8[np.ndarray, "h w *c"]
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]] | None:
-        """Corners seen in a picture (RGB or grey): board frame (m) and pixels (x, y); None where the board is not seen.
+        """Corners seen in a picture (RGB or grey): board frame (m) and pixels (x, y); None if the board is not found.
 
-        A chessboard is found whole or not at all, of a ChArUco board any part with 8 corners that are not in a line.
+        A chessboard is found whole or not at all, a ChArUco board from any part with 8 corners that are not in a line.
         """
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if self.kind == "charuco":
@@ -120,9 +120,9 @@ def _refined(grey: UInt8[np.ndarray, "h w"], pixels: np.ndarray, reach: float) -
 
 
 def parse_board(text: str) -> Board:
-    """The board that a text names: `chessboard:8x6:0.108` or `charuco:7x5:0.04:0.03:DICT_5X5_100`.
+    """The board that a text describes: `chessboard:8x6:0.108` or `charuco:7x5:0.04:0.03:DICT_5X5_100`.
 
-    Raises ValueError with the text, what is wrong with it, and the right form.
+    Raises ValueError with the text, its fault, and the right form.
     """
     kind, *parts = text.split(":")
     if (kind, len(parts)) not in (("chessboard", 2), ("charuco", 4)):

@@ -1,4 +1,4 @@
-"""Intrinsics from views of a board: the fit, how certain it is, and when it must not be used. Knows no source."""
+"""Intrinsics from views of a board: the fit, its uncertainty, and when it must not be used. Knows no source."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,10 +19,10 @@ _LEAST_NOISE_PX = 0.01
 
 @dataclass(frozen=True)
 class CalibrateConfig:
-    """When a view is left out, and what a calibration must reach to be saved."""
+    """When a view is left out, and the conditions for saving a calibration."""
 
     fewest_views: int = 3  # Zhang's method needs two for a pinhole without lens; one more tells that they agree
-    most_views: int = 60  # of a long recording, evenly taken
+    most_views: int = 60  # of a long recording, evenly spaced
     least_motion: float = 0.01  # of the picture's diagonal; a view whose corners moved less than this adds nothing
     stream_motion: float = 0.03  # the same, in a stream of pictures: a hand holds the board before a camera
     outlier: float = 3.0  # times the median view's error: a view beyond it is left out
@@ -56,7 +56,7 @@ class FittedView:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A camera, the views that it was made from, and those left out with the reason."""
+    """A camera, the views used for it, and the views left out with the reason."""
 
     camera: Camera  # with K_std, distortion_std and rms
     views: tuple[FittedView, ...]

@@ -1,4 +1,4 @@
-"""Camera files: the YAML that ROS's camera_info_manager writes and reads, with what a calibration knows besides."""
+"""Camera files: the YAML that ROS's camera_info_manager writes and reads, with the calibration's uncertainty."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,15 +11,15 @@ from calibration.camera import Camera
 from foundation.one_line import one_line
 from foundation.whole_file import write_whole
 
-# ROS's reader takes the keys that it knows and passes over this one.
+# ROS's reader ignores this key.
 _OURS = "farside_calibration"
 
 
 def write_camera(path: Path, camera: Camera, name: str = "camera") -> None:
-    """Write a camera to YAML, whole or not at all; `read_camera` gives exactly it back.
+    """Write a camera to YAML, whole or not at all; `read_camera` returns it exactly.
 
-    Keys are those of ROS's camera_calibration_parsers. The standard deviations and the RMS (px) stand under a key of
-    our own.
+    Keys are those of ROS's camera_calibration_parsers. The standard deviations and the RMS (px) are under a key of our
+    own.
     """
     distortion = camera.distortion
     content: dict[str, Any] = {

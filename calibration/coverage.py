@@ -47,9 +47,9 @@ def coverage(views: Sequence[FittedView], size: tuple[int, int]) -> Coverage:
 
 
 def next_views(seen: Coverage) -> list[str]:
-    """What to show the camera next, the most useful first; empty where the coverage is good.
+    """The views to take next, the most useful first; empty if the coverage is good.
 
-    Tilts tell the focal length, places the distortion, distances the principal point and the focal length.
+    Tilts determine the focal length, places the distortion, distances the principal point and the focal length.
     """
     advice = []
     leans = [seen.tilts[:, 0] > _TILT, seen.tilts[:, 0] < -_TILT, seen.tilts[:, 1] > _TILT, seen.tilts[:, 1] < -_TILT]

@@ -134,7 +134,7 @@ class Turntable:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop the motion where something went wrong in its midst, and close the port."""
+        """Stop the motion if an error ended the block, and close the port."""
         if kind is not None and self._line is not None:
             try:
                 self._line.write(b"!")  # feed hold: a table that nobody watches must not go on turning
@@ -143,16 +143,16 @@ class Turntable:
         self.close()
 
     def close(self) -> None:
-        """Give the port back."""
+        """Release the port."""
         if self._line is not None:
             try:
                 self._line.close()
-            except (serial.SerialException, OSError):  # a cable that is gone
+            except (serial.SerialException, OSError):  # the cable is unplugged
                 pass
         self._line = None
 
     def status(self) -> TurntableStatus:
-        """The controller's state and the table's angle now."""
+        """The controller's state and the table's present angle."""
         deadline = time.monotonic() + self.config.reply_timeout
         while True:
             self._write(b"?")
@@ -174,7 +174,7 @@ class Turntable:
         self._command("$X", self.config.reply_timeout)
 
     def zero(self) -> None:
-        """Call the present angle 0."""
+        """Define the present angle as 0."""
         self._command(f"G92{self.config.axis}0", self.config.reply_timeout)
 
     def move_to(self, angle: float) -> None:
@@ -191,7 +191,7 @@ class Turntable:
     # -------------------------------------------------------------------------------------------- conversation
 
     def _resynchronise(self) -> None:
-        """From whatever was going on to a controller that answers: a newline asks, a soft reset insists."""
+        """Bring the controller from any state to one that answers: a newline first, then a soft reset."""
         deadline = time.monotonic() + self.config.open_timeout
         for ask in itertools.cycle((b"\r\n", b"\r\n", b"\x18")):  # a controller that still boots loses the first ones
             if time.monotonic() >= deadline:
@@ -200,7 +200,7 @@ class Turntable:
             patience = min(deadline, time.monotonic() + min(1.5, 0.2 * self.config.open_timeout))
             while (line := self._read_line(patience)) is not None:
                 if line == "ok" or line.startswith("Grbl "):
-                    while self._read_line(time.monotonic() + _QUIET_S) is not None:  # what earlier bytes still answer
+                    while self._read_line(time.monotonic() + _QUIET_S) is not None:  # answers to earlier bytes
                         pass
                     self.status()
                     return
@@ -259,7 +259,7 @@ class Turntable:
             raise TurntableError(f"turntable on {self.port} is in state {state}; {remedy}")
 
     def _report(self, line: str) -> TurntableStatus | None:
-        """Of `<Run|MPos:1.0,0.0,0.0|WCO:...>`; None where noise has bitten a piece off."""
+        """The state and angle in `<Run|MPos:1.0,0.0,0.0|WCO:...>`; None if noise has damaged it."""
         state, *fields = line.strip("<>").split("|")
         values: dict[str, list[float]] = {}
         try:

@@ -1,7 +1,7 @@
-"""Where a camera stands to a turntable's plate, from a ChArUco board that lies on it.
+"""The camera's pose relative to a turntable's plate, from a ChArUco board that lies on it.
 
-Plate frame (metres): origin at the board's centre, z up, x along the board's columns to the right as it is printed,
-y towards its top edge. It turns with the plate, so that to it the camera goes round.
+Plate frame (metres): origin at the board's centre, z up, x along the board's columns to the right as it is printed, y
+towards its top edge. It turns with the plate, so in it the camera moves around the plate.
 """
 
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ _STEPS, _STEP_END = 50, 1e-10  # of the pose's fit; rad and m
 
 
 class PlateNotFoundError(ValueError):
-    """A picture does not tell where the plate is: one line that says what was seen."""
+    """The plate cannot be located in a picture: one line that says what was seen."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlatePose:
-    """Where the camera stood, and how well that is known."""
+    """The camera's pose, and its uncertainty."""
 
     T_plate_camera: Float[np.ndarray, "4 4"]  # p_plate = T_plate_camera @ p_camera, m
     corners: int

@@ -42,7 +42,7 @@ _REHEARSING = ContextVar("rehearsing", default=False)
 
 @contextmanager
 def rehearsal() -> Iterator[None]:
-    """Within, programs that are kept are made ready for what they are given but not run: they hand back zeros."""
+    """A context in which kept programs are made ready for their arguments but not run: they return zeros."""
     token = _REHEARSING.set(True)
     try:
         yield
@@ -52,14 +52,14 @@ def rehearsal() -> Iterator[None]:
 
 @cache
 def _folder() -> Path | None:
-    """Where programs are kept: in the folder that `FARSIDE_PROGRAMS` names. None, where it names none: nowhere."""
+    """The folder of kept programs, named by `FARSIDE_PROGRAMS`. None if it names none: nothing is kept."""
     named = os.environ.get("FARSIDE_PROGRAMS")
     if not named or jax.default_backend() != "cpu":
         return None
     own = Path(named) / f"programs-{_environment()}"
     try:
         own.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if own.stat().st_uid != os.getuid():  # what is read from it is run
+        if own.stat().st_uid != os.getuid():  # its content is executed
             return None
         own.touch()
         generations = sorted(own.parent.glob("programs-*"), key=lambda f: f.stat().st_mtime, reverse=True)
@@ -71,7 +71,7 @@ def _folder() -> Path | None:
 
 
 class Program:
-    """A function as `jax.jit` compiles it, but for where its compiled code comes from."""
+    """A function as `jax.jit` compiles it, except for the origin of its compiled code."""
 
     def __init__(
         self, function: Callable[..., Any], static_argnames: tuple[str, ...] = (), rehearse: bool = True
@@ -85,7 +85,7 @@ class Program:
         self._ready: dict[Any, Callable[..., Any]] = {}
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """As the function."""
+        """Call the function."""
         if _folder() is None:
             return self.jitted(*args, **kwargs)
         arguments = self._signature.bind(*args, **kwargs).arguments
@@ -107,7 +107,7 @@ class Program:
         """The program for these arguments: from its file, or compiled and kept there."""
         content = " ".join((*self._name, str(key[0]), str(key[1]), _told(static)))
         folder = _folder()
-        if " at 0x" in content or folder is None:  # an object whose name does not say what it is
+        if " at 0x" in content or folder is None:  # an object whose text does not identify it
             return lambda **arguments: self.jitted(**arguments, **static)
         path = folder / f"{self._name[1]}-{hashlib.sha256(content.encode()).hexdigest()[:32]}"
         try:
@@ -151,7 +151,7 @@ def _write(path: Path, compiled: jax.stages.Compiled) -> None:
     devices = {d.id for s in jax.tree.leaves(compiled.input_shardings) for d in s.device_set}
     # the tree as an object: equinox's marks of absent fields do not survive in a pickled treedef
     answer = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))
-    with contextlib.suppress(OSError):  # a full disk costs the next start its time, and no answer
+    with contextlib.suppress(OSError):  # a full disk only makes the next start slower
         write_whole(path, pickle.dumps((code, sorted(devices), answer)))
 
 
@@ -180,7 +180,7 @@ def _kind(leaf: Any) -> tuple:
 
 
 def _told(static: Mapping[str, Any]) -> str:
-    """Static arguments in words: functions of this package by name, as its source stands behind them."""
+    """Static arguments as text: functions of this package by name, since the digest covers their source."""
     return repr({
         name: f"{v.__module__}.{v.__qualname__}" if _is_plain(v) else v for name, v in sorted(static.items())
     })  # fmt: skip
@@ -193,7 +193,7 @@ def _is_plain(value: Any) -> bool:
 
 @cache
 def _environment() -> str:
-    """A digest of all that makes another program of the same function and arguments."""
+    """A digest of everything that changes the program of a function and its arguments."""
     package = Path(__file__).parent
     source = hashlib.sha256()
     for path in [*sorted(package.rglob("*.py")), library_path()]:
@@ -207,7 +207,7 @@ def _environment() -> str:
 
 
 def _processor() -> str:
-    """What instructions the processor knows, or its name."""
+    """The processor's instruction sets, or its name."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
     return next((line for line in lines if line.startswith(("flags", "Features"))), platform.processor())

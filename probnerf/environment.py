@@ -1,4 +1,4 @@
-"""Where compiled code is kept between processes, and what has to be set before JAX is imported. Imports no JAX."""
+"""Where compiled code is kept between processes, and the variables to set before JAX is imported. Imports no JAX."""
 
 import os
 from pathlib import Path

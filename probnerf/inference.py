@@ -1,4 +1,4 @@
-"""Observation in, Posterior out: the model, the pixel likelihood and a sampler put together (unit cube only)."""
+"""From an Observation to a Posterior: the model, the pixel likelihood and a sampler (unit cube only)."""
 
 import math
 from collections.abc import Callable
@@ -29,7 +29,7 @@ _log_likelihood = program()(log_likelihood)
 
 
 def likelihood_settings(config: InferConfig, sample_pose: bool = True) -> Likelihood:
-    """The likelihood's settings, for any view."""
+    """The likelihood's settings for any view."""
     return Likelihood(
         lattice=foam.Lattice(config.lattice, config.extent, below=config.below),
         colour_sigma=config.colour_sigma,
@@ -75,7 +75,7 @@ def without_sizes(likelihood: Likelihood) -> Likelihood:
 
 
 def asks_encoder(config: InferConfig, model: Model, picture: EncoderPicture | None) -> bool:
-    """Whether there is an encoder to ask, enough for it to see, and use for what it says."""
+    """Whether the encoder is used: there is one, it sees enough of the object, and its guess is needed."""
     # delta has too many dimensions for second derivatives
     if picture is None or not config.encoder_starts or config.sample_delta or not isinstance(model, ProbNeRF):
         return False

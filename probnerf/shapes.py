@@ -1,4 +1,4 @@
-"""What is asked of sampled positions: their shapes as voxels, their poses, and how many pixels they explain."""
+"""Properties of sampled positions: their shapes as voxels, their poses, and the share of explained pixels."""
 
 import jax
 import jax.numpy as jnp

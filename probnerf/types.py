@@ -128,7 +128,7 @@ class StopReason(StrEnum):
 
 
 class Diagnostics(eqx.Module):
-    """What a sampler says of itself; trouble is a result that travels with the posterior."""
+    """A sampler's diagnostics. Trouble is a result that travels with the posterior."""
 
     acceptance: Float[Array, ""]  # mean Metropolis acceptance over the last stage
     divergences: Int[Array, ""]  # trajectories whose energy error exceeded 1,000 nats or was not finite

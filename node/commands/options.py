@@ -89,14 +89,14 @@ class ReplayConfig:
 
     @property
     def inference(self) -> ControllerConfig:
-        """The controller's configuration with the method that was asked for."""
+        """The controller's configuration with the chosen method."""
         if self.method is None:
             return self.controller
         return replace(self.controller, infer=replace(self.controller.infer, method=self.method))
 
     @property
     def topics(self) -> TopicNames:
-        """The recording's topics that were asked for."""
+        """The chosen topics of the recording."""
         return TopicNames(self.colour_topic, self.depth_topic)
 
     @property
@@ -161,7 +161,7 @@ class Record:
     """Record frames of any source to an MCAP file, until Ctrl-C, the source's end, or --seconds."""
 
     source: Annotated[Positional[Path], arg(metavar="SOURCE")]
-    """Whatever `farside replay` reads."""
+    """Any source that `farside replay` reads."""
     out: Annotated[Path, arg(metavar="FILE.mcap")]
     """The recording, a new file."""
     seconds: Annotated[float | None, arg(metavar="N", help_behavior_hint="(default: no limit)")] = None
@@ -212,8 +212,8 @@ class View:
     """Show a node that runs, by its endpoint on the bus, such as tcp/127.0.0.1:7448."""
     node: Annotated[str, arg(metavar="NAME")] = "/farside"
     """Full name of that node."""
-    out: Annotated[Path | None, arg(metavar="FILE.png", help_behavior_hint="(default: open the page)")] = None
-    """Open no page; draw the object's picture here, or for several objects into this folder."""
+    out: Annotated[Path | None, arg(metavar="FILE.png|FILE.gif", help_behavior_hint="(default: open the page)")] = None
+    """Open no page; draw the picture here (.gif: hypotheses that turn), or for several objects into this folder."""
     port: Annotated[int, arg(metavar="N")] = 8765
     """Port of the page on this machine (127.0.0.1); 0 takes a free one."""
     token: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False

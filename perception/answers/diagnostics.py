@@ -8,7 +8,7 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class AnswerDiagnostics:
-    """What the sampler says of itself, how well its shapes explain the view, and how far off they may be.
+    """The sampler's diagnostics, how well its shapes explain the view, and the expected error.
 
     NaN: not measured, or not defined. Counts are whole numbers.
     """
@@ -30,8 +30,8 @@ class AnswerDiagnostics:
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, float]) -> "AnswerDiagnostics":
-        """From numbers by name, as in files and messages. A name that is missing gives NaN, one that is not known here
-        (of another version) is passed over. Raises ValueError where a value is no number.
+        """From numbers by name, as in files and messages. A missing name gives NaN, an unknown one (of another version)
+        is ignored. Raises ValueError if a value is not a number.
         """
         known = {}
         for name in (field.name for field in fields(cls)):

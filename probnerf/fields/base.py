@@ -1,4 +1,4 @@
-"""What a radiance field and a prior over fields offer."""
+"""The interfaces of a radiance field and of a prior over fields."""
 
 from typing import Protocol
 
@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 
 class Field(Protocol):
-    """What renderer and occupancy operator need of a field; parameters are one object's, points in its frame."""
+    """The interface for the renderer and the occupancy operator; parameters are one object's, points in its frame."""
 
     def density(self, weights: Float[Array, "d"], points: Float[Array, "... 3"]) -> Float[Array, "..."]:
         """Density sigma >= 0 per point; a lattice face there has optical depth scale * sigma / G."""

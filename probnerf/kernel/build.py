@@ -1,7 +1,8 @@
-"""Compile the kernel with the machine's C++ compiler, once: `python -m probnerf.kernel.build`. Without one, say so.
+"""Compile the kernel with the machine's C++ compiler, once: `python -m probnerf.kernel.build`. Reports a missing
+compiler.
 
-The sources travel with the package. The library lies in the user's cache folder under a digest of all that it is made
-from, so that a checkout, an installed package and several versions of both stand beside each other.
+The sources travel with the package. The library lies in the user's cache folder under a digest of its sources, options
+and versions, so that a checkout, an installed package and several versions can coexist.
 """
 
 import fcntl
@@ -31,13 +32,13 @@ X86: dict[str, tuple[int, int, list[str]]] = {
 
 
 def compiler() -> str | None:
-    """$CXX, or the first of the usual ones that is there."""
+    """$CXX, or the first of the usual compilers that is installed."""
     return next((found for name in (os.environ.get("CXX"), *COMPILERS) if name and (found := shutil.which(name))), None)
 
 
 @cache
 def library_path() -> Path:
-    """Where the built library belongs."""
+    """The place of the built library."""
     digest = hashlib.sha256(repr((OPTIONS, PLAIN, X86, jax.__version__, platform.machine())).encode())
     for path in sorted([*SOURCES.glob("*.cc"), *SOURCES.glob("*.h")]):
         digest.update(path.name.encode() + path.read_bytes())
@@ -45,9 +46,9 @@ def library_path() -> Path:
 
 
 def built_library() -> Path | None:
-    """The library, built if it is not there yet; None where that failed or nothing can build it.
+    """The library, built if it is missing; None if the build failed or there is no compiler.
 
-    What failed once is not tried again until `failed.txt`, which holds the compiler's words, is removed.
+    A failed build is not repeated until `failed.txt`, which holds the compiler's messages, is removed.
     """
     path = library_path()
     if path.is_file():
@@ -63,13 +64,13 @@ def built_library() -> Path | None:
                 print("farside: building the kernel, once; this takes some seconds", file=sys.stderr)
                 if complaint := _build(cxx, path):
                     failure.write_text(complaint)
-    except OSError as error:  # a full or read-only disk costs speed, and no answer
+    except OSError as error:  # a full or read-only disk costs only speed
         print(f"farside: the kernel cannot be kept in {path.parent} ({error.strerror or error})", file=sys.stderr)
     return path if path.is_file() else None
 
 
 def _build(cxx: str, path: Path) -> str:
-    """Write the library; what the compiler said where it failed, else ""."""
+    """Write the library; the compiler's messages if it failed, else ""."""
     sets = PLAIN | (X86 if platform.machine() in ("x86_64", "AMD64") else {})
     with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
         runs, objects = [], []
@@ -97,7 +98,7 @@ def _build(cxx: str, path: Path) -> str:
 
 
 def main() -> None:
-    """Build, and say where it is or what is missing."""
+    """Build, and print the library's place or what is missing."""
     library_path().with_name("failed.txt").unlink(missing_ok=True)
     if built_library() is not None:
         return

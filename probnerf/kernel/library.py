@@ -13,7 +13,7 @@ VIEW_TERMS, DENSITY = "farside_view_terms", "farside_density"
 
 @cache
 def available() -> bool:
-    """Whether JAX runs on the CPU and the kernel is built, which the first call does; `FARSIDE_KERNEL=0` says no."""
+    """Whether JAX runs on the CPU and the kernel is built. The first call builds it. `FARSIDE_KERNEL=0` disables it."""
     if os.environ.get("FARSIDE_KERNEL") == "0" or jax.default_backend() != "cpu":
         return False
     path = built_library()

@@ -1,4 +1,4 @@
-"""Populations of samples: several runs side by side, a run's samples as another's start, a few that stand for all."""
+"""Populations of samples: several runs as one posterior, samples as starts of another run, and representatives."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What the stages of tempered SMC left behind: the present particles, samples with their diagnostics, and counts."""
+"""The record of the stages of tempered SMC: the present particles, samples with their diagnostics, and counts."""
 
 import time
 from dataclasses import dataclass, field
@@ -28,7 +28,7 @@ class SMCState(eqx.Module):
 
 
 class StageStats(eqx.Module):
-    """What a stage says of each population."""
+    """The statistics of a stage, by population."""
 
     ess: Float[Array, "m"]  # effective sample size of the weights that it was resampled by (NaN: it was not)
     acceptance: Float[Array, "m"]  # mean over the stage
@@ -38,7 +38,7 @@ class StageStats(eqx.Module):
 
 @dataclass(eq=False)
 class SMCRecord:
-    """What the stages so far left behind: the present state, pools to make samples of, and counts."""
+    """The record of the stages so far: the present state, pools for samples, and counts."""
 
     config: TemperedSMCConfig
     state: SMCState
@@ -52,7 +52,7 @@ class SMCRecord:
 
     @property
     def complete(self) -> bool:
-        """All final stages are made."""
+        """Whether all final stages are made."""
         return len(self.pools) == self.config.final_stages
 
     @property
@@ -62,7 +62,9 @@ class SMCRecord:
         return float(self.config.populations * self.config.particles * (1 + self.stages * each))
 
     def limit_reached(self, cap: int, deadline: float | None) -> StopReason | None:
-        """What leaves no room for a next stage, if anything: their number, or the time of the shortest so far."""
+        """The limit that leaves no room for a next stage, if any: the number of stages, or the time of the shortest so
+        far.
+        """
         if self.stages >= cap:
             return StopReason.STAGES
         expected = self.shortest_s if self.stages > 1 else 0.0
@@ -71,7 +73,7 @@ class SMCRecord:
         return None
 
     def add(self, state: SMCState, stats: StageStats, pool: HMCState, begun: float) -> None:
-        """Take in a stage that was begun then."""
+        """Add a stage that began at this time."""
         acceptance = float(np.mean(np.asarray(stats.acceptance)))  # waits for the device
         if bool(np.all(np.asarray(self.state.beta) == 1.0)):
             self.pools = [*self.pools, pool]
@@ -82,7 +84,7 @@ class SMCRecord:
             self.shortest_s = min(self.shortest_s, time.monotonic() - begun)
 
     def stage_info(self) -> StageInfo:
-        """The last stage, or the start, as callers are told of it."""
+        """The last stage, or the start, as callbacks get it."""
 
         def row(a: Array) -> tuple[float, ...]:
             return tuple(np.asarray(a).tolist())
