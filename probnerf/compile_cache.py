@@ -5,6 +5,9 @@ than to read it. So a program is found by what it is made from, without making i
 source, its arguments' structure, shapes and static values, JAX's version and settings, and the processor. What that
 does not tell apart (a local function, or another package's) is left to `jax.jit`, and so is everything on other devices
 than CPUs, and where `FARSIDE_PROGRAMS` names no folder.
+
+It stays for what it saves at a start: `farside bench startup` was 3.1 s with kept programs (gate: 5 s), 28 s with an
+empty cache. Where JAX's own cache alone comes within 2 s of that, this module goes.
 """
 
 import contextlib
