@@ -1,4 +1,4 @@
-"""The position vector that samplers move, taken apart.
+"""The position vector that samplers move, split into its parts.
 
 A position is a flat vector [z~ (K) | a, b, x, y, log-scale, range offset, z (7, if the pose is unknown) | delta (D, if
 open)], each entry a priori N(0, 1), so the log prior is the same standard normal for every model and tempering is one

@@ -1,4 +1,4 @@
-"""What the encoder is given: the camera's numbers, and an image whose pixels carry their place in the object frame."""
+"""The encoder's input: the camera's numbers, and an image whose pixels carry their place in the object frame."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -10,7 +10,7 @@ ENCODER_RADIUS = 1.25  # the encoder's picture shows this much around the cube's
 
 
 def camera_features(T_object_camera: Float[Array, "4 4"], tan_half_fov: Float[Array, ""]) -> Float[Array, "13"]:
-    """What the encoder is told of a camera: rotation, a fifth of its position, the tangent of its half field."""
+    """The camera's numbers for the encoder: rotation, a fifth of its position, the tangent of its half field."""
     return jnp.concatenate(
         [T_object_camera[:3, :3].reshape(-1), 0.2 * T_object_camera[:3, 3], jnp.atleast_1d(tan_half_fov)]
     )

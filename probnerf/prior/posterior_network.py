@@ -1,4 +1,4 @@
-"""What the encoder takes an object for, at every yaw: where climbs start (`probnerf.sampling.modes`).
+"""The encoder's guesses of an object, at every yaw: where climbs start (`probnerf.sampling.modes`).
 
 It needs the camera in the canonical object frame, which the unknown yaw turns.
 """

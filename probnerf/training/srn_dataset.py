@@ -249,7 +249,7 @@ def _read_picture(path: Path, size: tuple[int, int]) -> tuple[UInt8[np.ndarray, 
         raise ValueError(f"{path} is {image.dtype}{list(image.shape)}; save it as RGB or RGBA with 8 bits a channel")
     if image.shape[:2] != size:
         raise ValueError(
-            f"{path} is {image.shape[1]}x{image.shape[0]} px but intrinsics.txt says {size[1]}x{size[0]}; mend one"
+            f"{path} is {image.shape[1]}x{image.shape[0]} px but intrinsics.txt says {size[1]}x{size[0]}; correct one"
         )
     rgb = np.ascontiguousarray(image[..., 2::-1])
     if image.shape[2] == 4 and image[..., 3].min() < 255:  # an alpha that is opaque everywhere marks nothing
