@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ from perception.answers.query import QueryResult
 from perception.answers.query import query as ask
 from perception.answers.regions import Box, Cells, Points, Region, Swept, read_mesh
 from perception.answers.scene import Scene
+from perception.inference.controller import Estimate
+from perception.inference.controller import estimate as estimate_object
 from perception.inference.scene import estimate_each
 from perception.inference.settings import ControllerConfig
 from perception.inference.tracker import Tracker
@@ -99,12 +102,17 @@ def estimate(
         segments = segment(frame)
     elif isinstance(segments, Segment):
         segments = [segments]
+    weights = load_prior() if prior is None else prior
+
+    def estimate_one(found: Segment, budget: float | None) -> Estimate:
+        on_stage = None if on_progress is None else partial(on_progress, found.id)
+        return estimate_object(
+            frame, found, weights, config, seed=seed, budget_s=budget, stages=stages, on_stage=on_stage
+        )
+
     done, left_out = [], {}
     complaint = ValueError("there is no segment to infer; give at least one")
-    for found, result in estimate_each(
-        frame, segments, load_prior() if prior is None else prior, config, seed=seed, stages=stages,
-        deadline=None if budget_s is None else begun + budget_s, on_stage=on_progress,
-    ):  # fmt: skip
+    for found, result in estimate_each(segments, estimate_one, None if budget_s is None else begun + budget_s):
         if isinstance(result, ValueError):
             left_out[found.id], complaint = str(result), result
         else:

@@ -81,7 +81,7 @@ def test_estimate_tells_its_progress_and_names_what_it_leaves_out(
         on_stage(farside.StageInfo)
         return type("Estimate", (), {"hypotheses": mug_hypotheses(frame, segment, [1.0], [1.0], 16)})
 
-    monkeypatch.setattr("perception.inference.scene.estimate", stand_in)
+    monkeypatch.setattr(api, "estimate_object", stand_in)
     both = [farside.segment(frame, 1)[0]] * 2
     object.__setattr__(second := farside.Segment(**vars(both[1])), "id", 2)
     scene = farside.estimate(frame, [both[0], second], prior=object(), on_progress=lambda i, info: calls.append(i))

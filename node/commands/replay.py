@@ -21,6 +21,7 @@ from perception.answers.hypotheses import Hypotheses
 from perception.answers.hypotheses_file import frame_path, hypotheses_path, load, save
 from perception.answers.summary import summarise
 from perception.inference.controller import Estimate, estimate
+from perception.inference.scene import estimate_each
 from perception.inference.settings import ControllerConfig
 from perception.observation.segmentation import Segment, segment
 from perception.observation.settings import SegmentConfig
@@ -60,17 +61,16 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
     kept, done = frame_path(config.folder), list[Hypotheses]()
     is_source = config.source is not None and config.source.resolve() == kept.resolve()
     complaint = ValueError("no object")
-    for i, found in enumerate(segments):
-        share = None
-        if limit is not None:
-            share = (begun + limit - time.monotonic()) / (len(segments) - i) - PICTURE_S
-        try:
-            budget = None if share is None else max(share, 1.0)
-            result = infer(frame, found, prior, config.inference, err, config.seed, config.stages, budget)
-        except ValueError as error:
+
+    def infer_one(found: Segment, budget: float | None) -> Estimate:
+        return infer(frame, found, prior, config.inference, err, config.seed, config.stages, budget)
+
+    deadline = None if limit is None else begun + limit
+    for found, result in estimate_each(segments, infer_one, deadline, PICTURE_S):
+        if isinstance(result, ValueError):
             if len(segments) > 1:
-                err.print(f"object {found.id} is left out: {error}", highlight=False, soft_wrap=True)
-            complaint = ValueError(f"{source}: {error}")
+                err.print(f"object {found.id} is left out: {result}", highlight=False, soft_wrap=True)
+            complaint = ValueError(f"{source}: {result}")
             continue
         if not done and not is_source:
             (kept / "meta.json").unlink(missing_ok=True)  # an older frame must not stay beside new objects
@@ -94,7 +94,7 @@ def _segmentation(frame: Frame, config: ReplayConfig) -> SegmentConfig:
     if config.box is None:
         return config.segment
     if frame.depth is not None:
-        raise ValueError("the frame has depth, which finds its objects: leave --box away, or add --colour-only")
+        raise ValueError("the frame has depth, which finds its objects: omit --box, or add --colour-only")
     return replace(config.segment, mask=replace(config.segment.mask, box_px=config.box))
 
 
