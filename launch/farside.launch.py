@@ -1,7 +1,7 @@
-"""For a ROS 2 workspace: `ros2 launch launch/farside.launch.py config:=launch/live.yaml`.
+"""Launch file for a ROS 2 workspace: `ros2 launch launch/farside.launch.py config:=launch/live.yaml`.
 
-The node is a program of its own that speaks to ROS 2 over Zenoh: set RMW_IMPLEMENTATION=rmw_zenoh_cpp for the others
-and start their router (`ros2 run rmw_zenoh_cpp rmw_zenohd`). `farside` must be on PATH, or be named with `program:=`.
+The node is a separate program that connects to ROS 2 over Zenoh. Set RMW_IMPLEMENTATION=rmw_zenoh_cpp for the other
+nodes and start their router (`ros2 run rmw_zenoh_cpp rmw_zenohd`). `farside` must be on PATH; else give `program:=`.
 """
 
 import shlex

@@ -1,4 +1,4 @@
-"""The paper's sampler: independent Hamiltonian chains that are cooled as they go."""
+"""The paper's sampler: independent, annealed Hamiltonian Monte Carlo chains."""
 
 import time
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from probnerf.sampling.hmc import HMCState, LogLikelihood, StageInfo, Target, hm
 from probnerf.settings import AnnealedHMCConfig
 from probnerf.types import Diagnostics, Posterior, StopReason
 
-MAX_ANNEALED_STEP = 1.0  # radians: a turn of the prior beyond it is never useful
+MAX_ANNEALED_STEP = 1.0  # radians; larger rotations under the prior are never useful
 
 
 @partial(jax.jit, static_argnames=("log_likelihood", "chains", "dim"))
@@ -37,13 +37,14 @@ def annealed_hmc(
     on_stage: Callable[[StageInfo], bool | None] | None = None,
     deadline: float | None = None,
 ) -> Posterior:
-    """The paper's sampler (section 3.3): independent chains cooled from s_start to s_end, s_t = s_0^(1-t/T) s_T^(t/T).
+    """The paper's sampler (section 3.3): independent chains, annealed by the scale s_t = s_start^(1-t/T) s_end^(t/T).
 
-    Every likelihood term is multiplied by (s_end / s_t)^2 and the step size is proportional to s_t. Kept are the last
-    `keep` states of each chain, equally weighted; all but the very last are drawn at s_t > s_end, so this is no sample
-    of the posterior, and there is no evidence (NaN). The integrator is the split one with identity mass. `deadline` is
-    on time.monotonic()'s clock. result is "stages" when the schedule was completed, else "budget", "stopped" (by
-    `on_stage`) or "interrupted", with the states at hand. `point_gradients` counts gradients of whole positions.
+    The log-likelihood is multiplied by (s_end / s_t)^2. The step size is proportional to s_t. The result holds the last
+    `keep` states of each chain with equal weights. All but the last one are drawn at s_t > s_end, so they are not
+    samples of the posterior. There is no evidence estimate (NaN). The integrator is the split one with identity mass.
+    `deadline` is on time.monotonic()'s clock. `result` is "stages" if the schedule was completed, else "budget",
+    "stopped" (by `on_stage`) or "interrupted", with the states so far. `point_gradients` counts gradient evaluations of
+    whole positions.
     """
     config = config or AnnealedHMCConfig()
     begun = time.monotonic()
@@ -59,7 +60,7 @@ def annealed_hmc(
 
     try:
         for t in range(1, config.iterations + 1):
-            # An iteration costs about the mean of those before: none is begun that would overrun the deadline.
+            # Expect an iteration to take the mean time of those before. Start none that would pass the deadline.
             now = time.monotonic()
             if deadline is not None and now + (now - begun) / t > deadline:
                 result = StopReason.BUDGET

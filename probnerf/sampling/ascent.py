@@ -1,4 +1,4 @@
-"""Climbing from many starts at once: Adam on a batch of positions."""
+"""Gradient ascent from many starts at once: Adam on a batch of positions."""
 
 from collections.abc import Callable
 from functools import partial
@@ -19,10 +19,10 @@ Objective = Callable[[Any, Any, Array], Array]
 def ascend(
     objective: Objective, args: Any, start: Float[Array, "p d"], config: AdamConfig, batches: Any = None
 ) -> tuple[Float[Array, "p d"], Float[Array, "steps p"]]:
-    """Maximise `objective` from each start; also its values before every step.
+    """Maximise `objective` from each start. Returns the final positions and the values before each step.
 
-    `batches` is data with a leading axis of `steps`, one slice a step (a fresh subset of pixels, say), or None.
-    Starts do not touch: Adam works entry by entry. A gradient that is not finite counts as 0.
+    `batches` is data with a leading axis of `steps`, one slice per step (for example a new subset of pixels), or None.
+    The starts are independent, because Adam works element by element. A gradient entry that is not finite counts as 0.
     """
     schedule = optax.cosine_decay_schedule(
         config.learning_rate, config.steps, config.final_learning_rate / config.learning_rate

@@ -1,4 +1,4 @@
-"""A mixture of Gaussians over positions: drawn from, evaluated, and differentiated."""
+"""A mixture of Gaussians over positions, with draws and a differentiable density."""
 
 import equinox as eqx
 import jax
@@ -10,22 +10,22 @@ from probnerf.sampling.populations import log_prior
 
 
 class GaussianMixture(eqx.Module):
-    """sum_k exp(log_weight_k) N(mean_k, (root_k root_k^T)^-1), the roots lower triangular; weights sum to 1."""
+    """sum_k exp(log_weight_k) N(mean_k, (root_k root_k^T)^-1), with lower triangular roots. Weights sum to 1."""
 
     log_weight: Float[Array, "k"]
     mean: Float[Array, "k d"]
     root: Float[Array, "k d d"]  # Cholesky factor of the precision
 
     def log_density(self, q: Float[Array, "p d"]) -> Float[Array, "p"]:
-        """log of the density, nats."""
-        # Full precision: a stiff direction multiplies a difference by hundreds.
+        """Log-density, nats."""
+        # Full precision, because a stiff direction multiplies a difference by several hundred.
         white = jnp.einsum("pkd,kde->pke", q[:, None] - self.mean, self.root, precision="highest")
         log_det = jnp.sum(jnp.log(jnp.diagonal(self.root, axis1=1, axis2=2)), axis=-1)
         each = -0.5 * jnp.sum(white * white + jnp.log(2.0 * jnp.pi), axis=-1)
         return logsumexp(self.log_weight + log_det + each, axis=-1)
 
     def over_prior(self, position: Float[Array, "p d"]) -> Float[Array, "p"]:
-        """log of the density over N(0, I)'s, nats."""
+        """Log of the ratio of this density to that of N(0, I), nats."""
         return self.log_density(position) - log_prior(position)
 
     def draw(self, key: PRNGKeyArray, count: int) -> Float[Array, "count d"]:

@@ -1,17 +1,17 @@
 """Hamiltonian Monte Carlo for standard-normal latents.
 
 Symbols: q position [..., D]; v whitened momentum [..., D] ~ N(0, I); l log-likelihood; beta inverse temperature; r the
-reference, where the way to the posterior begins, and g = log r - log N(0, I) (r is the prior unless given, g = 0 then).
+reference density at beta = 0; g = log r - log N(0, I). Unless r is given, it is the prior, and g = 0.
 Target: r(q)^(1 - beta) (N(q; 0, I) exp(l(q)))^beta = N(q; 0, I) exp(f(q)) with f = (1 - beta) g + beta l. With mass
 matrix M and Omega = M^(-1/2), v = Omega p, Hamilton's equations are
 
     dq/dt = Omega v,    dv/dt = -Omega q + Omega grad f(q),    H = (|q|^2 + |v|^2) / 2 - f(q).
 
-Without f each eigenvector of Omega is a harmonic oscillator of frequency omega, solved exactly by a turn of (q, v) by
-the angle omega t. The split integrator (half kick, turn, half kick; Shahbaba et al. 2014) makes an error only where f
-speaks: its step size does not shrink with the directions that likelihood and reference leave alone.
+Without f, each eigenvector of Omega is a harmonic oscillator of frequency omega. Its exact solution rotates (q, v) by
+the angle omega t. The split integrator (half kick, rotation, half kick; Shahbaba et al. 2014) has errors only from f.
+So directions that f does not depend on do not limit the step size.
 
-All chains run as one batch. Nothing here compiles per chain, and nothing logs inside jit.
+All chains run as one batch. Nothing compiles per chain, and nothing logs inside jit.
 """
 
 from collections.abc import Callable
@@ -27,12 +27,12 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from probnerf.types import Posterior
 
 # (args, q [p, d]) -> log-likelihood [p]; differentiable, rows independent. It is a static argument of the compiled
-# functions: pass the same function object again (not a new lambda) and only `args` may change without compiling.
+# functions. To avoid compiling again, pass the same function object (not a new lambda) and change only `args`.
 LogLikelihood = Callable[[Any, Float[Array, "p d"]], Float[Array, "p"]]
 
 
 class Reference(Protocol):
-    """A density to begin at: a PyTree, so that another one of the same shapes compiles nothing."""
+    """A density to start from. It is a PyTree, so another one of the same shapes needs no compilation."""
 
     def draw(self, key: PRNGKeyArray, count: int) -> Float[Array, "count d"]:
         """Independent draws."""
@@ -44,7 +44,7 @@ class Reference(Protocol):
 
 
 MAX_ENERGY_ERROR = 1000.0  # nats; beyond it a trajectory counts as divergent
-JITTER = (0.8, 1.2)  # random factor of the step size, so that no trajectory length is a multiple of a period
+JITTER = (0.8, 1.2)  # range of a random factor of the step size; it avoids trajectories of whole periods
 
 
 class Metric(eqx.Module):
@@ -60,29 +60,30 @@ class Metric(eqx.Module):
         self, along: Float[Array, "... p r"], across: Float[Array, "... p 1"], x: Float[Array, "... p d"]
     ) -> Array:
         """The function of Omega with eigenvalues `along` the basis and `across` it, applied to each row of x."""
-        # Full precision: the tensor cores' short floats would cost reversibility.
+        # Full precision: the reduced precision of tensor cores would break reversibility.
         inner = jnp.einsum("...pd,...rd->...pr", x, self.basis, precision="highest")
         return across * x + jnp.einsum("...pr,...rd->...pd", (along - across) * inner, self.basis, precision="highest")
 
 
 def gradient_metric(force: Float[Array, "n d"], log_w: Float[Array, "n"], rank: int) -> Metric:
-    """M = I + Cov(grad f) over weighted draws, kept along its `rank` stiffest directions (stiffest first).
+    """M = I + Cov(grad f) over weighted draws, restricted to its `rank` stiffest directions (stiffest first).
 
-    On the way from the prior, for a Gaussian likelihood of precision K and draws of the target, it is
-    I + beta^2 K (I + beta K)^-1 K: about the target's precision I + beta K in every stiff direction, and exactly the
-    prior's where the likelihood says nothing. It needs no more draws than there are stiff directions, in any dimension.
+    For a path from the prior, a Gaussian likelihood of precision K and draws of the target, it is
+    I + beta^2 K (I + beta K)^-1 K. In stiff directions this is close to the target's precision I + beta K. In
+    directions that the likelihood does not constrain, it equals the prior's precision. It needs only as many draws as
+    there are stiff directions, in any dimension.
     """
     weight = jnp.exp(log_w - jax.scipy.special.logsumexp(log_w))
     weight = jnp.where(jnp.isfinite(weight), weight, 0.0)
-    # An overflow here would poison a whole population; a slope of 10^12 pins its direction as well as any.
+    # Clip: an overflow would make the whole population NaN. A slope of 10^12 already fixes its direction.
     g = jnp.clip(force, -1e12, 1e12)
     g = jnp.sqrt(weight)[:, None] * (g - weight @ g)
     g = jnp.pad(g, ((0, max(0, rank - len(g))), (0, 0)))
-    if g.shape[1] > g.shape[0]:  # few draws of many dimensions: in the space that they span
+    if g.shape[1] > g.shape[0]:  # fewer draws than dimensions: work in the space that they span
         span, _ = jnp.linalg.qr(g.T)
         g = jnp.matmul(g, span, precision="highest")
-    # An eigendecomposition is 30 times faster here than a singular value decomposition. Squaring costs the precision of
-    # variances 10^7 below the largest, which costs speed and not correctness: the basis stays orthonormal.
+    # An eigendecomposition is 30 times faster here than a singular value decomposition. Squaring loses variances that
+    # are 10^7 times below the largest. This can cost speed, but not correctness: the basis stays orthonormal.
     variance, vectors = jnp.linalg.eigh(jnp.matmul(g.T, g, precision="highest"))
     variance, vectors = jnp.maximum(variance, 0.0)[::-1][:rank], vectors[:, ::-1][:, :rank]
     basis = vectors if g.shape[1] == force.shape[1] else jnp.matmul(span, vectors, precision="highest")
@@ -90,7 +91,7 @@ def gradient_metric(force: Float[Array, "n d"], log_w: Float[Array, "n"], rank: 
 
 
 class Target(eqx.Module):
-    """r(q)^(1 - beta) (N(q; 0, I) exp(l(args, q)))^beta, seen through a metric (None: the identity)."""
+    """r(q)^(1 - beta) (N(q; 0, I) exp(l(args, q)))^beta, with a metric (None: the identity)."""
 
     log_likelihood: LogLikelihood = eqx.field(static=True)
     args: Any
@@ -99,12 +100,12 @@ class Target(eqx.Module):
     reference: Reference | None = None  # r; None: the prior
 
     def value(self, position: Float[Array, "... d"]) -> Float[Array, "..."]:
-        """The log-likelihood at `position`, without its gradient; where not finite, -inf."""
+        """The log-likelihood at `position`, without its gradient; -inf if it is not finite."""
         value = self.log_likelihood(self.args, position.reshape(-1, position.shape[-1]))
         return jnp.where(jnp.isfinite(value), value, -jnp.inf).reshape(position.shape[:-1])
 
     def evaluate(self, position: Float[Array, "... d"]) -> "HMCState":
-        """Evaluates the likelihood and its gradient at `position`; where not finite, it is -inf with gradient 0."""
+        """The target's terms at `position`. A log-likelihood that is not finite becomes -inf, with gradient 0."""
         flat = position.reshape(-1, position.shape[-1])
         value, pullback = jax.vjp(lambda q: self.log_likelihood(self.args, q), flat)
         (gradient,) = pullback(jnp.ones_like(value))
@@ -120,17 +121,17 @@ class Target(eqx.Module):
 
 
 class HMCState(eqx.Module):
-    """Positions with what the target is made of there, whatever beta."""
+    """Positions, and the target's terms there, which do not depend on beta."""
 
     position: Float[Array, "... d"]
     log_likelihood: Float[Array, "..."]  # -inf where the likelihood is not finite
-    gradient: Float[Array, "... d"]  # of it
-    over_prior: Float[Array, "..."]  # g, of the reference
+    gradient: Float[Array, "... d"]  # of the log-likelihood
+    over_prior: Float[Array, "..."]  # the reference's g
     over_gradient: Float[Array, "... d"]
 
     @property
     def log_ratio(self) -> Float[Array, "..."]:
-        """log of (prior x likelihood) / reference: what a step of beta multiplies the weights by."""
+        """log of (prior x likelihood) / reference. A step of beta adds step times this to the log weights."""
         return self.log_likelihood - self.over_prior
 
     def force(self, beta: Float[Array, "..."]) -> Float[Array, "... d"]:
@@ -140,7 +141,7 @@ class HMCState(eqx.Module):
 
 
 class HMCInfo(eqx.Module):
-    """What one HMC iteration says of each chain."""
+    """Diagnostics of one HMC iteration, per chain."""
 
     acceptance: Float[Array, "..."]  # Metropolis acceptance probability
     accepted: Bool[Array, "..."]
@@ -151,10 +152,10 @@ class HMCInfo(eqx.Module):
 def leapfrog(
     state: HMCState, momentum: Float[Array, "... d"], target: Target, step_size: Float[Array, "..."], steps: int
 ) -> tuple[HMCState, Float[Array, "... d"]]:
-    """`steps` steps of the split integrator: half kick by f, exact turn under the prior, half kick.
+    """`steps` steps of the split integrator: half kick by f, exact rotation under the prior, half kick.
 
-    `step_size` broadcasts against the leading axes; `momentum` is the whitened v. One gradient a step. The map
-    preserves volume, and flipping the momentum reverses it.
+    `step_size` broadcasts against the leading axes. `momentum` is the whitened v. Each step needs one gradient. The map
+    preserves volume and is reversible: flip the momentum to go back.
     """
     epsilon = jnp.broadcast_to(step_size, state.position.shape[:-1])[..., None]
     push, beta = 0.5 * epsilon, jnp.broadcast_to(target.beta, epsilon.shape[:-1])
@@ -195,9 +196,9 @@ def leapfrog(
 def energy_error(
     start: HMCState, v0: Array, end: HMCState, v1: Array, beta: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """H(end) - H(start), summed as differences: H itself can be 10^4 while 10^-2 matters."""
+    """H(end) - H(start), as a sum of differences. H can be 10^4, while a difference of 10^-2 matters."""
     quadratic = (end.position - start.position) * (end.position + start.position) + (v1 - v0) * (v1 + v0)
-    # At beta = 0 the target is the prior, and a likelihood of -inf is no obstacle.
+    # At beta = 0 the target does not depend on the likelihood, so a log-likelihood of -inf is allowed.
     likelihood = jnp.where(beta > 0, beta * (end.log_likelihood - start.log_likelihood), 0.0)
     return 0.5 * jnp.sum(quadratic, axis=-1) - likelihood - (1.0 - beta) * (end.over_prior - start.over_prior)
 
@@ -227,7 +228,7 @@ def hmc_step(
 
 
 def split_r_hat(draws: Float[np.ndarray, "chains n"]) -> float:
-    """Split R-hat (Gelman et al., BDA3 eq. 11.4) of a scalar; NaN where undefined (under 4 draws, all equal)."""
+    """Split R-hat (Gelman et al., BDA3 eq. 11.4) of a scalar; NaN if undefined (fewer than 4 draws, or all equal)."""
     half = draws.shape[1] // 2
     if half < 2 or not np.all(np.isfinite(draws)):
         return float("nan")
@@ -239,9 +240,9 @@ def split_r_hat(draws: Float[np.ndarray, "chains n"]) -> float:
 
 @dataclass(frozen=True)
 class StageInfo:
-    """Progress of a sampler after one stage; tuples have one entry per population (one for all of HMC's chains)."""
+    """Progress of a sampler after one stage. Tuples have one entry per population (for HMC, one for all chains)."""
 
-    stage: int  # from 0, which is the start
+    stage: int  # 0 is the start
     beta: tuple[float, ...]  # inverse temperature reached; 1 is the posterior
     ess: tuple[float, ...]  # effective sample size of the last importance weights (NaN where there were none)
     acceptance: tuple[float, ...]
@@ -249,4 +250,4 @@ class StageInfo:
     log_evidence: tuple[float, ...]  # of the tempered target at `beta` (NaN for samplers that have none)
     divergences: int  # so far
     seconds: float  # since the start
-    samples: Callable[[], Posterior]  # the draws at hand, of the target at `beta`; made when asked for
+    samples: Callable[[], Posterior]  # the current draws, of the target at `beta`; built when called

@@ -1,6 +1,6 @@
-"""One best shape: maximum a posteriori (MAP) by Adam from several starts.
+"""Maximum a posteriori (MAP) estimate of the shape, by Adam from several starts.
 
-A point estimate has no weights and no doubt: beside the posterior it shows what uncertainty is worth.
+A point estimate expresses no uncertainty. It is a baseline that shows what the full posterior adds.
 """
 
 from dataclasses import dataclass, replace
@@ -21,10 +21,10 @@ from probnerf.types import Observation
 
 @dataclass(frozen=True)
 class MAPConfig(AdamConfig):
-    """A short climb from every start, and a whole one of the best."""
+    """A short ascent from every start, then a full ascent from the best ones."""
 
-    screen_steps: int = 50  # every start climbs so far,
-    survivors: int = 4  # and the best so many go on for `steps`
+    screen_steps: int = 50  # Adam steps from every start
+    survivors: int = 4  # number of best starts that continue for `steps`
 
 
 @partial(jax.jit, static_argnames="config")
@@ -35,7 +35,7 @@ def map_estimate(
     starts: Float[Array, "p d"],
     config: MAPConfig,
 ) -> tuple[Float[Array, "d"], Float[Array, "survivors"]]:
-    """The best position that Adam reaches from the starts, and the log posterior of each survivor, best first."""
+    """The best position that Adam reaches from the starts, and the survivors' log posteriors, best first."""
     args = (model, likelihood, observation, faces_of_view(observation, likelihood))
 
     def climb(q: Float[Array, "p d"], steps: int) -> tuple[Array, Array]:

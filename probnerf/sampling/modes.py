@@ -1,10 +1,10 @@
-"""Where a posterior's modes are, and a density about them for the sampler to begin at.
+"""Find a posterior's modes, and build a density around them from which the sampler starts.
 
-A mode that is narrow holds next to nothing of the prior, and of any flattened posterior: on the way from the prior
-(beta = 0) it is lost to wider and poorer ones, and no population finds it again. Climbing finds it in a second. So many
-starts climb, a Gaussian is laid about the top of each (Laplace's approximation, widened), and tempering leads from
-their mixture to the posterior: q(x)^(1 - beta) posterior(x)^beta. A share of it is the prior, so that in the
-limit of many particles the answer does not depend on the mixture; what a finite number finds does.
+A narrow mode has almost no mass under the prior or under a tempered posterior. On the path from the prior (beta = 0)
+the particles move to wider, poorer modes, and no population finds the narrow one again. Gradient ascent finds it in
+a second. So many starts ascend, and each mode found gets a Gaussian (a widened Laplace approximation). Tempering then
+goes from their mixture to the posterior: q(x)^(1 - beta) posterior(x)^beta. The mixture includes the prior, so in the
+limit of many particles the result does not depend on the other components. With few particles, it does.
 """
 
 import jax
@@ -20,18 +20,18 @@ from probnerf.sampling.gaussian_mixture import GaussianMixture
 from probnerf.settings import ModesConfig
 from probnerf.types import Observation
 
-# what `model.log_likelihood` takes
+# arguments of `likelihood.dispatch.log_likelihood`
 Args = tuple[Model, Likelihood, Observation, Float[Array, "n m"]]
 
-# The yaw's latents (a, b) = r (cos, sin) with any r: r^2 / 2 is exponential, so that r has mean 1.25, deviation 0.66.
+# The yaw's latents are (a, b) = r (cos, sin) with any r. r^2 / 2 is exponential: r has mean 1.25, std 0.66.
 _RADIUS, _RADIUS_SIGMA = 1.25, 0.66
 
 
 def log_posterior(args: tuple, _: None, positions: Float[Array, "p d"]) -> Float[Array, "p"]:
-    """Log-likelihood plus log prior, up to a constant, in which the yaw is uniform.
+    """Log-likelihood plus log prior, up to a constant, with a uniform prior on the yaw.
 
-    `args` are those of `model.log_likelihood`. The yaw's latents (a, b) are left out of the prior: only their angle
-    means anything, and the density of N(0, I) over them would pull the best yaw into the origin, where it has none.
+    `args` are those of `log_likelihood`. The prior leaves out the yaw's latents (a, b), because only their angle has a
+    meaning. The density N(0, I) would pull them to the origin, where the yaw is undefined.
     """
     model, likelihood = args[:2]
     weigh = jnp.ones(positions.shape[-1])
@@ -42,21 +42,21 @@ def log_posterior(args: tuple, _: None, positions: Float[Array, "p d"]) -> Float
 
 @program("config")
 def mixture_of_modes(args: Args, starts: Float[Array, "k d"], config: ModesConfig) -> GaussianMixture:
-    """Gaussians about the modes that the starts climb to, and the prior.
+    """A mixture of the prior and one Gaussian for each mode that an ascent reaches.
 
-    Of each two neighbouring starts only the better one climbs all the way. About a mode the precision is that of the
-    prior plus the likelihood's (its Hessian by differences of the gradient, rising directions left out) over `widen`.
-    Climbs that end in one mode are as many Gaussians there.
+    Of each pair of neighbouring starts, only the better one completes the ascent. A Gaussian's precision is that of the
+    prior plus the likelihood's over `widen`. The likelihood's precision is its negative Hessian, by differences of the
+    gradient, without directions of positive curvature. If several ascents reach one mode, each adds its own Gaussian.
     """
     model, likelihood = args[:2]
     top, _ = ascend(log_posterior, args, starts, config.screen)
-    # neighbours in yaw, not the best of all: modes that are far apart must not compete before they are climbed
+    # compare only neighbours in yaw: distant modes must not compete before their ascents are complete
     value = log_posterior(args, None, top).reshape(-1, 2)
     top = top.reshape(len(value), 2, -1)[jnp.arange(len(value)), jnp.argmax(value, axis=1)]
     top, _ = ascend(log_posterior, args, top, config.climb)
     dim = top.shape[1]
     toward = jnp.zeros_like(top)
-    if likelihood.sample_pose:  # only the angle of (a, b) climbs: put their length where the posterior has it
+    if likelihood.sample_pose:  # only the angle of (a, b) was optimised: set the length to its prior mean
         at = slice(model.latent, model.latent + 2)
         toward = toward.at[:, at].set(
             top[:, at] / jnp.maximum(jnp.linalg.norm(top[:, at], axis=1, keepdims=True), 1e-6)
@@ -79,7 +79,7 @@ def mixture_of_modes(args: Args, starts: Float[Array, "k d"], config: ModesConfi
 def _stiffness(args: Args, q: Float[Array, "k d"], step: float) -> tuple[Float[Array, "k d"], Float[Array, "k d d"]]:
     """Eigenvalues (0 or more) and eigenvectors (columns) of the log-likelihood's negative Hessian at each position."""
     slope = jax.grad(lambda x: jnp.sum(log_likelihood(args, x)))
-    # an offset at a time, so that it takes no more memory than the climb
+    # one offset at a time, to need no more memory than the ascent
     here, there = slope(q), jax.lax.map(lambda offset: slope(q + offset), step * jnp.eye(q.shape[1]))  # [d, k, d]
     hessian = jnp.nan_to_num(here - there, posinf=0.0, neginf=0.0).swapaxes(0, 1) / step
     along, axes = jnp.linalg.eigh(0.5 * (hessian + hessian.swapaxes(1, 2)))

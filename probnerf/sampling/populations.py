@@ -11,18 +11,19 @@ from jaxtyping import Array, Float, Int
 from probnerf.sampling.hmc import HMCState, split_r_hat
 from probnerf.types import Diagnostics, Posterior, StopReason
 
-# Nats under the best population's evidence from which on one has failed: it never left a poor mode. Those that found
-# different good ones differ by a few nats, which are mostly noise. On validation views no answer got worse by it; under
-# 30 nats answers became too sure.
+# A population has failed if its log-evidence is more than this below the best one (nats): it never left a poor mode.
+# Populations in different good modes differ by a few nats, mostly noise. On validation views this threshold made no
+# answer worse. Below 30 nats, answers became overconfident.
 FAILED = 100.0
 
 
 def shares(
     log_evidences: Float[np.ndarray, "m"], power: float
 ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, ""] | float]:
-    """Each population's share of the weight (its logarithm), by its evidence to a power; log of the mean evidence.
+    """Log of each population's share of the weight, from its evidence to a power; and log of the mean evidence.
 
-    One that has failed has none. Even shares and NaN where an estimate is missing or none is finite.
+    A failed population has no share. Without any finite evidence, the shares are equal. If an estimate is NaN, the
+    shares are equal and the mean is NaN.
     """
     even = np.full(len(log_evidences), -np.log(len(log_evidences)))
     if np.isnan(log_evidences).any():
@@ -45,11 +46,11 @@ def gathered(
     others: dict[str, Array],
     result: StopReason,
 ) -> Posterior:
-    """The pools [m, n, ...] of a run's last stages as one posterior; `others` are its further diagnostics.
+    """The pools [m, n, ...] of a run's last stages as one posterior. `others` holds the remaining diagnostics.
 
-    `variance` is that of each evidence estimate, were the particles of a population independent.
+    `variance` is the variance of each log-evidence estimate, assuming that a population's particles are independent.
     """
-    # NumPy: the number of pools varies, and nothing may compile for it.
+    # NumPy, because the number of pools varies and must not cause a compilation.
     positions = np.stack([np.asarray(pool.position) for pool in pools])  # [keep, m, n, d]
     values = np.stack([np.asarray(pool.log_likelihood) for pool in pools])
     by_population = values.swapaxes(0, 1).reshape(values.shape[1], -1)
@@ -65,10 +66,10 @@ def gathered(
         error = float(max(spread, within))
     log_weights = np.broadcast_to((share - np.log(values.size / populations))[None, :, None], values.shape).ravel()
     population = np.broadcast_to(np.arange(populations, dtype=np.int32)[None, :, None], values.shape).ravel()
-    # f of the target r^(1 - beta) (prior x likelihood)^beta = prior x exp(f), over the estimate of its integral
+    # log-density of the target r^(1 - beta) (prior x likelihood)^beta = prior x exp(f), normalised by its evidence
     f = (1.0 - beta[:, None]) * over + np.where(beta[:, None] > 0, beta[:, None] * values, 0.0)
     log_normal = -0.5 * np.sum(positions.astype(np.float64) ** 2 + np.log(2.0 * np.pi), axis=-1)
-    with np.errstate(invalid="ignore"):  # no likelihood anywhere
+    with np.errstate(invalid="ignore"):  # every likelihood is zero
         log_density = log_normal + f - log_evidences[:, None]
     return Posterior(
         positions=jax.device_put(positions.reshape(-1, positions.shape[-1])),
@@ -90,9 +91,10 @@ def gathered(
 
 
 def pooled(posteriors: Sequence[Posterior], evidence_power: float) -> Posterior:
-    """Independent runs of tempered SMC at beta = 1, on one target and of one size, as one posterior of all populations.
+    """Combine independent tempered SMC runs into one posterior with all their populations.
 
-    Acceptance and `result` are the last run's; counts are added up. The evidence's error is the populations' spread.
+    All runs have reached beta = 1, on the same target and with the same sizes. Acceptance and `result` come from the
+    last run. Counts are summed. The error of the evidence is estimated from the spread of the populations.
     """
     if len(posteriors) == 1:
         return posteriors[0]
@@ -109,7 +111,7 @@ def pooled(posteriors: Sequence[Posterior], evidence_power: float) -> Posterior:
     def summed(counts: Sequence[Array]) -> Array:
         return jax.device_put(np.sum(np.stack([np.asarray(c) for c in counts]), axis=0))
 
-    def joined(arrays: Sequence[Array]) -> Array:  # NumPy: the number of runs varies, and nothing may compile for it
+    def joined(arrays: Sequence[Array]) -> Array:  # NumPy, as in `gathered`: the number of runs varies
         return jax.device_put(np.concatenate([np.asarray(a) for a in arrays]))
 
     return replace(
@@ -136,18 +138,18 @@ def pooled(posteriors: Sequence[Posterior], evidence_power: float) -> Posterior:
 
 
 def start_from(before: Posterior, populations: int) -> tuple[Float[Array, "m n d"], Float[Array, "m n"]]:
-    """The samples of tempered SMC as starts of another run: positions per population, and log-densities there.
+    """Samples of tempered SMC as starts of another run: positions per population, and the log-density at each.
 
-    By each population's own estimate of its evidence, so that the estimates go on from where they were, and populations
-    keep their shares. Where there were more than `populations`, several stand together as one. Raises ValueError if
-    they do not divide.
+    The log-density uses each population's own evidence estimate. So the new estimates continue the old ones, and the
+    populations keep their shares. If there were more than `populations`, they are merged into groups. Raises ValueError
+    if their number is not a multiple of `populations`.
     """
     m, size = len(before.diagnostics.beta), before.positions.shape[-1]
     if m % populations:
         raise ValueError(f"{m} populations of samples do not divide into {populations}")
     order = np.argsort(np.asarray(before.population), kind="stable")
     shape = (populations, len(order) // populations)
-    positions, log_density = np.asarray(before.positions), np.asarray(before.log_density)  # so that nothing compiles
+    positions, log_density = np.asarray(before.positions), np.asarray(before.log_density)  # NumPy: nothing compiles
     starts = positions[order].reshape(*shape, size), log_density[order].reshape(shape)
     return jax.device_put(starts[0]), jax.device_put(starts[1])
 
@@ -158,10 +160,11 @@ def log_prior(q: Float[Array, "... d"]) -> Float[Array, "..."]:
 
 
 def thin(posterior: Posterior, count: int) -> tuple[Int[np.ndarray, "s"], Float[np.ndarray, "s"], Int[np.ndarray, "s"]]:
-    """(indices, weights f64, population) of `count` representative samples, or one a population where those are more.
+    """(indices, weights f64, population) of `count` representative samples, but at least one per population.
 
-    Each population that has any weight keeps an equal number of them, or the first ones one more, taken systematically
-    by weight, and its own share of the weight: a planner sees each, and their disagreement is the Monte Carlo error.
+    Only populations with non-zero weight count. Each keeps the same number of samples; the first ones keep one more if
+    the division leaves a remainder. Samples are chosen systematically by weight. Each population keeps its share of the
+    weight. So a planner sees every population, and their disagreement is the Monte Carlo error.
     """
     log_w = np.asarray(posterior.log_weights, np.float64)
     population = np.asarray(posterior.population)

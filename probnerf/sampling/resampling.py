@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-# Fractions of the remaining way to beta = 1, 40 a decade. A grid, as the ESS need not fall with beta under proposals.
+# Fractions of the distance left to beta = 1, 40 per decade. A grid, because the ESS may not be monotonic in beta.
 _FRACTIONS = np.geomspace(1e-9, 1.0, 361).astype(np.float32)
 
 
 def ess(log_w: Float[Array, "n"]) -> Float[Array, ""]:
-    """(sum w)^2 / sum w^2; 0 if no weight is left. Never above n, so that no variance made of it is below 0."""
+    """(sum w)^2 / sum w^2; 0 if all weights are 0. Clipped to n, so a variance computed from it is never negative."""
     top = jnp.max(log_w)
     w = jnp.exp(log_w - jnp.where(jnp.isfinite(top), top, 0.0))
     return jnp.minimum(jnp.sum(w) ** 2 / jnp.maximum(jnp.sum(w * w), 1e-30), float(log_w.size))
@@ -21,7 +21,8 @@ def next_beta(
 ) -> tuple[Float[Array, ""], Float[Array, "n"], Float[Array, ""]]:
     """The largest beta at which the weights exp(log_w) L^step have ESS `enough`; their logarithms; their ESS.
 
-    Where none has (dead particles, poor proposals), the beta of the largest ESS; with no live particle at all, 1.
+    If no beta reaches `enough` (zero likelihoods, poor proposals), the beta with the largest ESS. If all likelihoods
+    are zero, beta is 1.
     """
 
     def weights(step):
@@ -32,16 +33,16 @@ def next_beta(
     last = sizes.size - 1
     index = jnp.where(jnp.any(sizes >= enough), last - jnp.argmax((sizes >= enough)[::-1]), jnp.argmax(sizes))
     index = jnp.where(jnp.any(jnp.isfinite(log_likelihood)), index, last)
-    new = jnp.where(index == last, 1.0, beta + steps[index])  # in float32 beta + (1 - beta) need not be 1
+    new = jnp.where(index == last, 1.0, beta + steps[index])  # in float32, beta + (1 - beta) can differ from 1
     return new, weights(new - beta), sizes[index]
 
 
 def resample(key: PRNGKeyArray, log_w: Float[Array, "n"], count: int) -> Int[Array, "c"]:
-    """Systematic resampling: indices of `count` particles, each drawn count * w_i times up to rounding."""
+    """Systematic resampling: indices of `count` particles, each drawn count * w_i times, rounded up or down."""
     top = jnp.max(log_w)
     total = jnp.cumsum(jnp.where(jnp.isfinite(top), jnp.exp(log_w - top), 1.0))
     u = (jnp.arange(count) + jax.random.uniform(key)) / count
-    u = jnp.minimum(u, 1.0 - 2.0**-24)  # rounding up to 1 would pass the last particle of positive weight
+    u = jnp.minimum(u, 1.0 - 2.0**-24)  # u = 1 would index past the last particle with positive weight
     return jnp.searchsorted(total / total[-1], u, side="right")
 
 

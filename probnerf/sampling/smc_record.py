@@ -1,4 +1,4 @@
-"""The record of the stages of tempered SMC: the present particles, samples with their diagnostics, and counts."""
+"""The record of the stages of tempered SMC: the current particles, samples with their diagnostics, and counts."""
 
 import time
 from dataclasses import dataclass, field
@@ -15,22 +15,22 @@ from probnerf.types import Posterior, StopReason
 
 
 class SMCState(eqx.Module):
-    """m populations of p particles, resampled at beta and not yet moved there."""
+    """m populations of p particles, resampled for the target at beta but not yet moved there."""
 
     chain: HMCState
     beta: Float[Array, "m"]
     log_evidence: Float[Array, "m"]  # of the target at beta
-    variance: Float[Array, "m"]  # of log_evidence, were all particles of a pool independent: sum of 1 / ESS - 1 / size
+    variance: Float[Array, "m"]  # of log_evidence, assuming independent particles: sum of 1 / ESS - 1 / size
     ancestor: Int[Array, "m p"]  # index of the initial particle
-    step_size: Float[Array, "m 2"]  # of every other particle, tuned on the others
+    step_size: Float[Array, "m 2"]  # of the even and the odd particles; each is tuned on the other half
     metric: Metric  # with a leading axis m
-    moved: Float[Array, "m"]  # accepted moves of a particle, on average, since beta was raised
+    moved: Float[Array, "m"]  # mean number of accepted moves per particle since beta last increased
 
 
 class StageStats(eqx.Module):
-    """The statistics of a stage, by population."""
+    """The statistics of a stage, per population."""
 
-    ess: Float[Array, "m"]  # effective sample size of the weights that it was resampled by (NaN: it was not)
+    ess: Float[Array, "m"]  # effective sample size of the resampling weights (NaN: no resampling)
     acceptance: Float[Array, "m"]  # mean over the stage
     step_size: Float[Array, "m"]  # the last one used
     divergences: Int[Array, ""]
@@ -38,7 +38,7 @@ class StageStats(eqx.Module):
 
 @dataclass(eq=False)
 class SMCRecord:
-    """The record of the stages so far: the present state, pools for samples, and counts."""
+    """The record of the stages so far: the current state, the pools of samples, and counts."""
 
     config: TemperedSMCConfig
     state: SMCState
@@ -48,22 +48,23 @@ class SMCRecord:
     stages: int = 0
     divergences: int = 0
     acceptance: float = float("nan")  # mean over the last stage
-    shortest_s: float = float("inf")  # of the stages but the first, which may compile
+    shortest_s: float = float("inf")  # shortest stage, except the first, which may compile
 
     @property
     def complete(self) -> bool:
-        """Whether all final stages are made."""
+        """Whether all final stages are complete."""
         return len(self.pools) == self.config.final_stages
 
     @property
     def gradients(self) -> float:
-        """Evaluations of whole positions with gradient: of the particles that the start chose, and in each stage."""
+        """Gradient evaluations of whole positions: once per particle chosen at the start, then in every stage."""
         each = self.config.moves * self.config.leapfrog_steps
         return float(self.config.populations * self.config.particles * (1 + self.stages * each))
 
     def limit_reached(self, cap: int, deadline: float | None) -> StopReason | None:
-        """The limit that leaves no room for a next stage, if any: the number of stages, or the time of the shortest so
-        far.
+        """The limit that forbids another stage, or None.
+
+        It is the number of stages, or the deadline if the shortest stage so far would pass it.
         """
         if self.stages >= cap:
             return StopReason.STAGES
@@ -73,7 +74,7 @@ class SMCRecord:
         return None
 
     def add(self, state: SMCState, stats: StageStats, pool: HMCState, begun: float) -> None:
-        """Add a stage that began at this time."""
+        """Add a completed stage. `begun` is its start time."""
         acceptance = float(np.mean(np.asarray(stats.acceptance)))  # waits for the device
         if bool(np.all(np.asarray(self.state.beta) == 1.0)):
             self.pools = [*self.pools, pool]
@@ -84,7 +85,7 @@ class SMCRecord:
             self.shortest_s = min(self.shortest_s, time.monotonic() - begun)
 
     def stage_info(self) -> StageInfo:
-        """The last stage, or the start, as callbacks get it."""
+        """The last stage, or the start, in the form that callbacks receive."""
 
         def row(a: Array) -> tuple[float, ...]:
             return tuple(np.asarray(a).tolist())
@@ -102,7 +103,7 @@ class SMCRecord:
         )
 
     def posterior(self, result: StopReason = StopReason.UNDERWAY) -> Posterior:
-        """The pools of the last `keep` stages as samples with diagnostics; before the first of them, the particles."""
+        """The pools of the last `keep` stages as samples with diagnostics. If there is no pool yet, the particles."""
         state, ancestors = self.state, np.asarray(self.state.ancestor)
         diagnostics = {
             "acceptance": jax.device_put(np.float32(self.acceptance)),

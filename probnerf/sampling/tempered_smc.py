@@ -1,18 +1,19 @@
 """Tempered sequential Monte Carlo: weighted samples and an evidence estimate for standard-normal latents.
 
-Independent populations of particles go from a reference r (beta = 0; the prior, unless another is given) to the
-posterior (beta = 1), along r^(1 - beta) (prior x L)^beta. A *stage* makes `moves` HMC iterations of every particle at
-the present beta; the states after each of them form the population's *pool* (no move is wasted: waste-free SMC, Dau and
-Chopin 2022). Then beta takes the longest step that keeps the effective sample size of the pool under the weights
-(prior x L / r)^(step) (conditional ESS, Zhou, Johansen and Aston 2016), and systematic resampling draws the next
-particles from it. The product of the mean weights estimates the evidence.
+Independent populations of particles go from a reference r (beta = 0; by default the prior) to the posterior (beta = 1)
+along r^(1 - beta) (prior x L)^beta. A *stage* makes `moves` HMC iterations of every particle at the current beta. The
+states after each iteration form the population's *pool* (waste-free SMC, Dau and Chopin 2022). Then beta takes the
+longest step that keeps the effective sample size of the pool under the weights (prior x L / r)^(step) (conditional ESS,
+Zhou, Johansen and Aston 2016). Systematic resampling draws the next particles from the pool. The product of the mean
+weights estimates the evidence.
 
-What tunes a move is not read off the states about to move. A population's metric is its neighbour's; the step size of
-every other particle comes from how often the rest of its own population was accepted at the move before (a neighbour
-may be in a mode of another width, and with its steps a population would stand still). Later moves depend on earlier
-ones through both halves, so this is exact as the number of particles grows. On a target of two widths the mass within
-1 was off by 0.004 (two standard errors) after 24 moves with 8 particles, and by 0.02 (ten) with 2. Beta waits until a
-population has moved: copies that resampling made agree with each other, and would let it run ahead.
+A move is never tuned on the states that it moves. A population uses the metric of its neighbour. It is split into two
+halves, every other particle. The acceptance of one half at a move sets the step size of the other half at the next.
+(The neighbour's step size would not do: it may be in a mode of another width, and the population could get stuck.)
+Later moves depend on earlier ones through both halves, so this is exact only in the limit of many particles. On a
+target with two widths, the mass within 1 was off by 0.004 (two standard errors) after 24 moves with 8 particles, and by
+0.02 (ten) with 2. Beta waits until a population has moved. Resampling makes copies that agree with each other; without
+the wait, beta would increase too fast.
 """
 
 import time
@@ -44,7 +45,7 @@ from probnerf.types import Posterior, StopReason
 
 
 def _metrics(force, log_w, config: TemperedSMCConfig) -> Metric:
-    """Each population's metric, from the weighted pool of the population before it."""
+    """Each population's metric, computed from the weighted pool of the population before it."""
     rank = min(config.moves * config.particles, force.shape[-1])
     force, log_w = jnp.roll(force, 1, axis=0), jnp.roll(log_w, 1, axis=0)
     metric = jax.vmap(lambda g, w: gradient_metric(g, w, rank))(force, log_w)
@@ -54,8 +55,8 @@ def _metrics(force, log_w, config: TemperedSMCConfig) -> Metric:
 def _log_ratio_at_starts(target: Target, q0, log_w0, config: TemperedSMCConfig) -> Float[Array, "m p0"]:
     """log of (prior x likelihood) / reference at starts q0 [m, p0, d]; -inf where a start has no weight.
 
-    In chunks as wide as every later evaluation, so that a large start takes no more memory. Gradients are evaluated of
-    the chosen ones only.
+    Evaluated in chunks of the same width as later evaluations, so a large start needs no more memory. Gradients are
+    evaluated only at the chosen starts.
     """
     populations, count, dim = q0.shape
     chunks = -(-count // config.particles)
@@ -64,18 +65,18 @@ def _log_ratio_at_starts(target: Target, q0, log_w0, config: TemperedSMCConfig) 
     value = jax.lax.map(target.value, padded).swapaxes(0, 1).reshape(populations, -1)[:, :count]
     value = jnp.where(jnp.isfinite(log_w0), value, -jnp.inf)
     reference = target.reference
-    if reference is not None:  # the next step's weights are of likelihood x prior over it
+    if reference is not None:  # the weights of the next step are prior x likelihood / reference
         value = value - reference.over_prior(q0.reshape(-1, dim)).reshape(value.shape)
     return value
 
 
 @program("log_likelihood", "config")
 def _start(key, args, q0, log_w0, reference, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig):
-    """Importance step from q0 [m, p0, d], whose weights for the reference are exp(log_w0), to the first beta > 0."""
+    """Importance step to the first beta > 0, from q0 [m, p0, d] with weights exp(log_w0) for the reference."""
     populations, count, _ = q0.shape
     target = Target(log_likelihood, args, jnp.zeros(()), None, reference)
     value = _log_ratio_at_starts(target, q0, log_w0, config)
-    enough = config.ess_target * config.particles  # a number, so that a larger start buys a longer first step
+    enough = config.ess_target * config.particles  # an absolute ESS: a larger start allows a longer first step
     beta, log_w, ess = jax.vmap(lambda w, v: next_beta(jnp.zeros(()), w, v, enough))(log_w0, value)
     ancestor = jnp.broadcast_to(jnp.arange(count), log_w.shape)
     position, ancestor = choose(key, log_w, (q0, ancestor), config.particles)
@@ -88,7 +89,7 @@ def _start(key, args, q0, log_w0, reference, *, log_likelihood: LogLikelihood, c
         ancestor=ancestor,
         step_size=jnp.full(
             (populations, 2), config.longest_step, jnp.float32
-        ),  # weakly typed, it compiles _stage twice
+        ),  # a weak type would compile _stage twice
         metric=_metrics(chain.force(beta[:, None]), jnp.zeros(ancestor.shape), config),
         moved=jnp.zeros(populations),
     )
@@ -97,7 +98,7 @@ def _start(key, args, q0, log_w0, reference, *, log_likelihood: LogLikelihood, c
 
 @program("log_likelihood", "config")
 def _stage(key, state: SMCState, args, reference, *, log_likelihood: LogLikelihood, config: TemperedSMCConfig):
-    """`moves` iterations at the present beta, then the step to the next beta and resampling (at beta = 1: neither)."""
+    """`moves` iterations at the current beta, then a step of beta and resampling. At beta = 1, only the iterations."""
     target = Target(log_likelihood, args, state.beta[:, None], state.metric, reference)
     move_key, resample_key = jax.random.split(key)
     (chain, step), (pool, acceptance, steps, divergences) = _hmc_moves(move_key, state, target, config)
@@ -120,13 +121,13 @@ def _hmc_moves(key, state: SMCState, target: Target, config: TemperedSMCConfig):
     """`moves` HMC iterations of every particle: (chains and step sizes after the last), (pool of the states after each
     [m, moves p], acceptance [moves, m], mean step size [moves, m], divergences [moves]).
 
-    After each iteration log(step) of every other particle grows by 2 (acceptance - target) with the acceptance of the
-    rest of its population, so that no step size depends on the states that it moves.
+    After each iteration, log(step) of each half changes by 2 (acceptance - target), with the acceptance of the other
+    half. So no step size depends on the states that it moves.
     """
     half = jnp.arange(config.particles) % 2
 
     def move(carry, key):
-        chain, step = carry  # step: [m, 2], of each half
+        chain, step = carry  # step: [m, 2], one per half
         chain, info = hmc_step(key, chain, target, step[:, half], config.leapfrog_steps)
         acceptance = info.acceptance @ (jax.nn.one_hot(half, 2) / jnp.bincount(half, length=2))
         tuned = jnp.minimum(step * jnp.exp(2.0 * (acceptance - config.target_acceptance)), config.longest_step)
@@ -139,12 +140,12 @@ def _hmc_moves(key, state: SMCState, target: Target, config: TemperedSMCConfig):
 
 
 def _next_temperature(beta, pool: HMCState, held, config: TemperedSMCConfig):
-    """Each population's next beta, the weights of its pool for it (log) and their effective sample size.
+    """Each population's next beta, the log weights of its pool for it, and their effective sample size.
 
-    The weights are (prior x likelihood / reference)^step, the step the longest that keeps the share `ess_target` of the
-    pool (CESS = (sum w)^2 / sum w^2 of
-    even weights: Zhou, Johansen and Aston 2016). Where `held`, there is no step:
-    copies that have not moved agree with each other, and their weights would let beta run ahead of them.
+    The weights are (prior x likelihood / reference)^step. The step is the longest that keeps an effective sample size
+    of `ess_target` times the pool's size (conditional ESS, here (sum w)^2 / sum w^2, since the weights before are
+    equal: Zhou, Johansen and Aston 2016). A `held` population takes no step: copies that have not moved agree with each
+    other, and beta would increase too fast.
     """
     size = config.moves * config.particles
     new, log_w, ess = jax.vmap(lambda b, v: next_beta(b, jnp.zeros(size), v, config.ess_target * size))(
@@ -154,16 +155,19 @@ def _next_temperature(beta, pool: HMCState, held, config: TemperedSMCConfig):
 
 
 def _resampled(key, log_w, pool: HMCState, ancestor, unchanged, tempering, config: TemperedSMCConfig):
-    """The next particles and their ancestors: drawn from the weighted pool by systematic resampling, in a population
-    that is tempering; the `unchanged` ones in another.
+    """The next particles and their ancestors.
+
+    A tempering population draws them from its weighted pool by systematic resampling. Others keep `unchanged`.
     """
     chosen = choose(key, log_w, (pool, jnp.tile(ancestor, (1, config.moves))), config.particles)
     return jax.tree.map(lambda a, b: jnp.where(tempering.reshape(-1, *[1] * (a.ndim - 1)), a, b), chosen, unchanged)
 
 
 def _evidence(state: SMCState, log_w, ess, tempering):
-    """log Z += log(mean weight of the pool) (Del Moral, Doucet and Jasra 2006), and the variance of log Z, as if the
-    particles of a pool were independent, += 1 / ESS - 1 / size. At beta = 1 neither grows.
+    """The updated evidence: log Z += log(mean weight of the pool) (Del Moral, Doucet and Jasra 2006).
+
+    The variance of log Z, assuming that a pool's particles are independent, += 1 / ESS - 1 / size. At beta = 1 neither
+    changes.
     """
     size = log_w.shape[1]
     log_evidence = jnp.where(
@@ -200,29 +204,29 @@ def tempered_smc(
     deadline: float | None = None,
     stages: int | None = None,
 ) -> Posterior:
-    """Samples N(q; 0, I) L(q) by adaptive tempered SMC, with an estimate of its integral, the evidence.
+    """Samples N(q; 0, I) L(q) by adaptive tempered SMC, and estimates its integral, the evidence.
 
-    `reference` is a density to begin at; it must cover the posterior, and owe nothing to `key`. Where modes are narrow,
-    one that knows them keeps them (`sampling.modes`). None: the prior. `initial` are instead positions drawn from
-    any density that covers what lies between the prior and the posterior from some beta on, say a run's that was cut
-    short, and the logarithm of that density there: they are reweighted to that beta.
+    `reference` is the density to start from (None: the prior). It must cover the posterior and must not depend on
+    `key`. If modes are narrow, a reference that contains them is needed to keep them (`sampling.modes`). `initial`
+    replaces it: positions drawn from some other density, and its logarithm there. They are reweighted to the first
+    beta. The density must cover the tempered targets from some beta on, as the samples of a stopped run do.
 
-    `deadline` is on the clock of time.monotonic(): no stage is begun that would pass it even if as short as the
-    shortest so far (but for the first, which may compile). `stages` caps their number. Without a deadline the answer
-    depends on key and stages alone. The start is always made.
+    `deadline` is on the clock of time.monotonic(). No stage starts if one as short as the shortest so far would pass it
+    (the first is not counted, because it may compile). `stages` limits their number. Without a deadline, the result
+    depends only on the key and the stages. The start is always made.
 
     The samples are the pools of the last `keep` stages. A population's share of the weight is its evidence estimate, so
-    that weighted averages stay consistent when populations found different modes; with few particles, whose estimates
-    err by nats, a smaller `evidence_power` keeps a lucky one from silencing the others; one that failed has no share
-    even so (`populations.FAILED`). log_evidence is the logarithm of the mean estimate; its error is the larger of two,
-    one from the populations' spread (which is chance with only two) and one from the weights' variance stage by stage
-    (which knows nothing of a mode that all particles missed).
+    weighted averages stay consistent if populations found different modes. With few particles the estimates have errors
+    of several nats. A smaller `evidence_power` then keeps one population from taking all the weight. A failed
+    population has no share (`populations.FAILED`). log_evidence is the logarithm of the mean estimate. Its error is the
+    larger of two estimates. One is the populations' spread, which is unreliable with only two. The other is the sum of
+    the weights' variances over stages, which does not include modes that all particles missed.
 
-    After each stage `on_stage` is told of it, may ask for the samples so far, and ends the run by answering True.
+    `on_stage` is called after each stage. It can request the samples so far, and ends the run if it returns True.
 
-    The result (`StopReason`) is CONVERGED at beta = 1 after all final stages. A run stopped before beta = 1 hands back
+    The result (`StopReason`) is CONVERGED at beta = 1 after all final stages. A run stopped before beta = 1 returns
     equally weighted draws of the tempered target, which is wider than the posterior, and NaN for the evidence.
-    `point_gradients` counts gradient evaluations of whole positions; the starts are only evaluated, but for the chosen.
+    `point_gradients` counts gradient evaluations of whole positions. Of the starts, only the chosen ones need them.
     """
     config = config or TemperedSMCConfig()
     begun = time.monotonic()
