@@ -21,11 +21,11 @@ from probnerf.types import StopReason
 
 
 def follow(config: ReplayConfig, out: Console, err: Console) -> bool:
-    """Infer what a recording's schedule says, frame by frame; False if Ctrl-C ended it.
+    """Repeat the inferences of a recording's schedule, frame by frame. Returns False if Ctrl-C ended it.
 
-    Results go to `<folder>/<stamp>/object_<id>.npz` and are compared with what the schedule says came out. What went on
-    from an earlier frame goes on from its repeat. Raises ValueError in one line, before anything is written, where
-    there is no schedule to follow, or another prior or configuration.
+    Results go to `<folder>/<stamp>/object_<id>.npz` and are compared with the schedule's digests. An inference that
+    continued from an earlier frame continues from the repeat of that frame. Raises ValueError in one line, before
+    anything is written, if there is no schedule, or if the prior or the configuration differs.
     """
     path = config.source or SHIPPED_LOG
     camera = None if config.camera is None else read_camera(config.camera)
@@ -34,10 +34,10 @@ def follow(config: ReplayConfig, out: Console, err: Console) -> bool:
     wanted = [entry for entry in entries if config.object in (None, entry.object_id)]
     if not wanted:
         whose = "" if config.object is None else f" for object {config.object}"
-        raise ValueError(f"{path} has no schedule{whose}; leave --schedule away")
+        raise ValueError(f"{path} has no schedule{whose}; omit --schedule")
     prior = load_prior(config.prior)
     _check(path, entries, prior, config)
-    # Without labels an object's id depends on the objects inferred before, so these are inferred, too.
+    # Without labels an object's id depends on the objects inferred before, so these are inferred too.
     last = max(entry.stamp_ns for entry in wanted)
     by_stamp: dict[int, list[Scheduled]] = {}
     for entry in (entry for entry in entries if entry.stamp_ns <= last):
@@ -85,7 +85,7 @@ def follow(config: ReplayConfig, out: Console, err: Console) -> bool:
 def _looks(
     tracker: Tracker, frame: Frame, scheduled: Sequence[Scheduled], config: ReplayConfig, err: Console
 ) -> dict[int, tuple[Segment, Look]]:
-    """The objects of a frame that the schedule tells of, by id."""
+    """The objects of a frame that are in the schedule, by id."""
     how = {entry.object_id: (entry.seed, entry.started_from == "fresh") for entry in scheduled}
     looks = {}
     try:

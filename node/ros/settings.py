@@ -1,4 +1,4 @@
-"""Settings of the bus (what it listens to, whom it admits; the same as Zenoh's settings) and of a camera's topics."""
+"""Settings of the bus (endpoints, admitted certificates, Zenoh's configuration) and of a camera's topics."""
 
 import re
 from dataclasses import dataclass
@@ -9,25 +9,25 @@ from perception.sources.topic_names import named_otherwise
 
 _NODE = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _SPACE = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
-# What an admitted certificate allows: everything that nodes of ROS 2 do, on this domain alone.
+# What an admitted certificate allows: everything that ROS 2 nodes do, on this domain only.
 _MESSAGES = ["put", "delete", "query", "reply", "declare_subscriber", "declare_queryable"]
 _GRAPH = ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
 
 
 @dataclass(frozen=True)
 class BusConfig:
-    """Where the bus listens, and whom it admits."""
+    """Where the bus listens, and which clients it admits."""
 
     domain_id: int = 0
     namespace: str = "/"
     name: str = "farside"
-    mode: Literal["peer", "client"] = "peer"  # client: everything goes through the router that it connects to
+    mode: Literal["peer", "client"] = "peer"  # client: all traffic goes through the router at `connect`
     listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)  # protocol/address:port; port 0: any; tls/... needs the files below
-    connect: tuple[str, ...] = ()  # such as tcp/127.0.0.1:7447, the router of ROS 2 on this machine
-    tls_ca: Path | None = None  # certificate authority that both sides' certificates must come from (mutual TLS)
+    connect: tuple[str, ...] = ()  # e.g. tcp/127.0.0.1:7447, the ROS 2 router on this machine
+    tls_ca: Path | None = None  # certificate authority of both sides' certificates (mutual TLS)
     tls_certificate: Path | None = None
     tls_key: Path | None = None
-    allowed: tuple[str, ...] = ()  # common names of the admitted certificates; none: all that TLS admits
+    allowed: tuple[str, ...] = ()  # common names of admitted certificates; empty: all that TLS admits
     max_message_bytes: int = 64_000_000
     max_request_bytes: int = 4_000_000  # of a service's request
     max_rate: float = 200.0  # messages per second of each topic and service, in and out
@@ -67,7 +67,7 @@ class BusConfig:
             "mode": self.mode,
             "listen": {"endpoints": list(self.listen) if self.mode == "peer" else []},
             "connect": {"endpoints": list(self.connect)},
-            # No search by multicast. Connected nodes announce the others (gossip), as nodes of ROS 2 find each other.
+            # No multicast scouting. Connected nodes announce the others (gossip), as ROS 2 nodes do.
             "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True}},
             "timestamping": {"enabled": True},  # which late joiners need
             # A sender above the limit is received and counted; far above it, its connection ends.
@@ -104,13 +104,13 @@ class TopicConfig:
     colour: str = "/camera/color/image_raw"
     depth: str | None = "/camera/aligned_depth_to_color/image_raw"  # aligned to colour; None: frames without depth
     info: str = "/camera/color/camera_info"
-    rectified: bool | None = None  # the images are: the camera is that of the info's P, without distortion; None: as
-    # the colour topic's name says, by a part rect or rectified
-    aligned: bool = False  # depth is aligned to colour though its frame_id is another
-    tolerance_ms: float = 10.0  # between the stamps of colour and depth
-    silence_s: float = 2.0  # without a frame, after which a note says so
+    rectified: bool | None = None  # images are rectified: the info's P, no distortion; None: rectified if
+    # the colour topic's name has a part rect or rectified
+    aligned: bool = False  # depth is aligned to colour although its frame_id differs
+    tolerance_ms: float = 10.0  # largest difference between the stamps of colour and depth
+    silence_s: float = 2.0  # without a frame, after which a note is printed
     end_s: float | None = None  # without a frame, after which the source ends; None: never
-    waiting: int = 10  # colour images that wait for their depth, at most
+    waiting: int = 10  # colour images that may wait for their depth
 
     def __post_init__(self) -> None:
         if not (self.tolerance_ms >= 0 and self.silence_s > 0 and self.waiting >= 1):

@@ -1,4 +1,4 @@
-"""Settings of inference on frames, publishing and tracking. Standard library only, for the command line reads them
+"""Settings of inference on frames, publishing and tracking. Standard library only: the command line reads them
 without JAX."""
 
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ class PublishConfig:
 
     hypotheses: int = 48  # shapes published
     grid: int = 64  # voxels per axis, G
-    out_of_model_below: float = 0.90  # share of telling pixels explained on average; validation objects: 0.91 and more
+    out_of_model_below: float = 0.90  # mean share of informative pixels explained; validation objects: 0.91 and more
 
     def __post_init__(self) -> None:
         if self.hypotheses < 1:
@@ -24,13 +24,13 @@ class PublishConfig:
 
 @dataclass(frozen=True)
 class ControllerConfig(PublishConfig):
-    """What is inferred at most, when less is enough, and how finely it is published."""
+    """The most that is inferred, when inference may stop earlier, and how finely results are published."""
 
     infer: InferConfig = field(default_factory=InferConfig)  # of one run
     observe: ObserveConfig = field(default_factory=ObserveConfig)
     first_hypotheses: int = 8  # published while better ones are under way
     unexplained: float = 0.1  # share of pixels above which all runs are made
-    tolerance: float = 0.005  # nats a voxel of unseen space that having no more populations may lose
+    tolerance: float = 0.005  # nats per voxel of unseen space; accepted loss from having few populations
     runs: int = 4  # at most
 
     def __post_init__(self) -> None:
@@ -43,17 +43,17 @@ class ControllerConfig(PublishConfig):
 
 @dataclass(frozen=True)
 class TrackConfig:
-    """When a frame counts as a further view of an object, and when as another place of it."""
+    """When a frame counts as a further view of an object, and when the object counts as moved."""
 
-    views: int = 3  # kept of each object; a further one takes the place of the nearest
-    apart: float = 15.0  # degrees between the directions of two views; one from nearer by takes the other's place
+    views: int = 3  # kept of each object; a further one replaces the nearest
+    apart: float = 15.0  # degrees between the directions of two views; a nearer view replaces the other
     adds: float = 0.08  # share of the unseen space above the plane that a frame must see first; noise sees 0.01 to 0.03
-    checked: int = 32  # hypotheses that a frame is held against: the best of them counts
-    moved_below: float = 0.8  # share of telling pixels explained by the best of them under which the object has moved
+    checked: int = 32  # hypotheses that a frame is compared with; the best of them counts
+    moved_below: float = 0.8  # share of informative pixels that the best one explains; below it the object moved
     reach: float = 0.6  # half extents; without a label map the object nearer than this is the same one
-    plane_degrees: float = 2.0  # without T_world_camera the camera stands still while its plane does, to so much
-    plane_m: float = 0.01
-    objects: int = 16  # remembered; of more, those inferred longest ago are forgotten
+    plane_degrees: float = 2.0  # without T_world_camera: change of the plane's tilt up to which the camera is still
+    plane_m: float = 0.01  # and change of its distance
+    objects: int = 16  # kept in memory; beyond that, those inferred longest ago are dropped
 
     def __post_init__(self) -> None:
         if min(self.views, self.checked) < 1:

@@ -1,4 +1,4 @@
-"""Settings of segmentation and observation. Standard library only, for the command line reads them without OpenCV."""
+"""Settings of segmentation and observation. Standard library only: the command line reads them without OpenCV."""
 
 import math
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ class PlaneConfig:
     """Lengths in metres; those marked * hold up to 1 m from the camera and grow with `noise_growth` beyond."""
 
     tolerance: float = 0.008  # * half thickness of the slab that counts as the plane
-    lowest: float = 0.016  # * what stands on a plane has points higher than this
+    lowest: float = 0.016  # * objects on the plane have points higher than this
     highest: float = 0.5  # and lower than this
     triplets: int = 1000  # planes tried
     seed: int = 0
@@ -18,12 +18,12 @@ class PlaneConfig:
 
 @dataclass(frozen=True)
 class PlaneGuess:
-    """The plane that things stand on where no depth measures it: from the camera's height and tilt, or its pose."""
+    """The support plane without depth: from the camera's height and tilt, or from its pose."""
 
-    camera_height: float | None = None  # m over the table; with `tilt`, and then the camera's pose is not read
-    tilt: float | None = None  # degrees of the optical axis below the horizon; the picture's rows are level
-    table: float = 0.0  # m; the table's height in the world frame, where the camera's pose in it is known
-    height_sigma: float = 0.01  # m; standard deviation of the camera's height over the table
+    camera_height: float | None = None  # m above the table; needs `tilt`; replaces the camera's pose
+    tilt: float | None = None  # degrees of the optical axis below the horizon; no roll
+    table: float = 0.0  # m; the table's height in the world frame, used with the camera's pose
+    height_sigma: float = 0.01  # m; standard deviation of the camera's height above the table
     tilt_sigma: float = 1.0  # degrees; of its tilt
 
     def __post_init__(self) -> None:
@@ -43,14 +43,14 @@ class PlaneGuess:
 class MaskConfig:
     """Where objects' pixels come from without depth: the box, else the background, else the frame's label map."""
 
-    box_px: tuple[int, int, int, int] | None = None  # x0 y0 x1 y1 about one whole object, the last two beyond it
-    before: tuple[tuple[int, int, int, int], ...] = ()  # boxes of things that may stand before what is in the box
-    background: Path | None = None  # PNG of the same scene from the same place without the objects
-    difference: float = 8.0  # of CIELAB colours (lightness counts half: shadows) beyond which a pixel has changed
-    margin: float = 0.5  # of the box's sides: how much around it shows what is behind
+    box_px: tuple[int, int, int, int] | None = None  # x0 y0 x1 y1 around one whole object; x1 and y1 are exclusive
+    before: tuple[tuple[int, int, int, int], ...] = ()  # boxes of things that may occlude the object
+    background: Path | None = None  # PNG of the scene without the objects, by the same camera in the same place
+    difference: float = 8.0  # of CIELAB colours above which a pixel has changed; lightness counts half, for shadows
+    margin: float = 0.5  # of the box's sides: width of the surroundings that show the background
     iterations: int = 5  # of GrabCut
-    band: int = 3  # px each side of the outline that say nothing
-    least: int = 200  # px of what is an object
+    band: int = 3  # px on each side of the outline that are UNKNOWN
+    least: int = 200  # px of the smallest object
 
 
 @dataclass(frozen=True)
@@ -58,16 +58,16 @@ class SegmentConfig:
     """Lengths in metres; heights are above the support plane."""
 
     plane: PlaneConfig = field(default_factory=PlaneConfig)
-    above: float = 0.008  # points higher than this stand on the plane (within 1 m; see `noise_growth`)
+    above: float = 0.008  # points higher than this belong to objects (within 1 m; see `noise_growth`)
     base: float = 0.003  # lower pixels next to an object belong to it down to here (likewise)
     max_height: float = 0.5  # higher points are not on a tabletop
     voxel: float = 0.006  # points up to two voxels apart are one object
-    depth_step: float = 0.02  # pixels whose 3x3 neighbours on objects span more depth are on an outline
-    lifted: float = 0.02  # an object that ends higher than this may stand on another object
-    min_height: float = 0.02  # of what is found without a label map
-    min_pixels: int = 50  # a smaller mask says nothing about a shape
+    depth_step: float = 0.02  # a pixel is on an outline where its 3x3 neighbours on objects span more depth
+    lifted: float = 0.02  # an object whose lowest points are higher may stand on another object
+    min_height: float = 0.02  # of an object found without a label map
+    min_pixels: int = 50  # of the smallest usable mask
     min_cluster_pixels: int = 200
-    rim: int = 2  # px each side of a mask's outline that say nothing: mixed pixels, misregistered depth
+    rim: int = 2  # px on each side of a mask's outline that are UNKNOWN: mixed pixels, misregistered depth
     mask: MaskConfig = field(default_factory=MaskConfig)  # without depth
     guess: PlaneGuess = field(default_factory=PlaneGuess)  # without depth
 
@@ -79,28 +79,28 @@ class SegmentConfig:
 
 @dataclass(frozen=True)
 class ObjectFrameConfig:
-    """How a cube is put about an object, and how well its place and size count as known."""
+    """How a cube is placed around an object, and how uncertain its place and size are."""
 
-    xy_sigma: float = 0.08  # cube units; prior width of the body's axis about the guess
+    xy_sigma: float = 0.08  # cube units; standard deviation of the body's axis around the estimate
     log_scale_sigma: float = 0.06
-    hidden_sigma: float = 0.3  # added to all widths, times the share of the outline that is hidden or cut off
-    side_sigma: float = 0.08  # added to all widths where the camera does not look down on the top
-    rim_reach: float = 0.02  # m; a rim pixel this near its neighbour inside the outline is of the object
-    outline_px: int = 5  # px from the outline within which something nearer hides what goes on
-    min_height: float = 0.02  # m; the tabletop's range of sizes
+    hidden_sigma: float = 0.3  # added to all standard deviations, times the share of the outline hidden or cut off
+    side_sigma: float = 0.08  # added to all standard deviations where the camera does not look down on the top
+    rim_reach: float = 0.02  # m; a rim pixel this near its neighbour inside the outline belongs to the object
+    outline_px: int = 5  # px from the outline within which a nearer object may hide more of this one
+    min_height: float = 0.02  # m; the prior's range of sizes
     max_side: float = 0.40  # m
 
 
 @dataclass(frozen=True)
 class ObserveConfig(ObjectFrameConfig):
-    """How a segment becomes an Observation. Ray counts are fixed, so that no frame compiles anew."""
+    """How a segment becomes an Observation. Ray counts are fixed, so that no frame needs a new compilation."""
 
     colour_rays: int = 32  # OBJECT pixels
     free_rays: int = 26  # FREE pixels, half of them near the outline
     occluder_rays: int = 6  # UNKNOWN pixels that see something nearer
     range_sigma_a: float = 1.0e-3  # m; sigma of a range d: a + b d^2
     range_sigma_b: float = 2.0e-3  # 1/m
-    cube: float = 1.2  # half side (cube units) of the box that a ray must meet to be worth asking
-    outline_band: float = 0.25  # cube units either side of the mask that count as near its outline
-    range_offset_sigma: float = 0.005  # m; bias that all ranges of a view share
-    plane_sigma: float = 0.005  # m; of the plane's height, which a sensor measures at a grazing angle
+    cube: float = 1.2  # half side (cube units) of the box that a used ray must meet
+    outline_band: float = 0.25  # cube units on either side of the mask that count as near its outline
+    range_offset_sigma: float = 0.005  # m; bias shared by all ranges of a view
+    plane_sigma: float = 0.005  # m; of the plane's height, measured at a grazing angle

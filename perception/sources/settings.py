@@ -1,4 +1,4 @@
-"""Settings of recordings. Standard library only, for the command line reads them without OpenCV."""
+"""Settings of recordings. Standard library only: the command line reads them without OpenCV."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,20 +17,20 @@ class RecordConfig:
     # as PNG would take longer than zstd for the same size. `farside bench record` measures it.
 
     colour: Literal["raw", "png", "jpeg"] = "raw"
-    """raw costs the least time, png (exact) more time and less space, jpeg the least space. JPEG is not exact: its
-    hypotheses differ from those made live."""
+    """raw takes the least time. png is exact and takes more time and less space. jpeg takes the least space but is not
+    exact: its hypotheses differ from those made live."""
     jpeg_quality: int = 95
     """1 to 100."""
     depth: Literal["exact", "millimetres"] = "exact"
-    """exact: 16UC1 where depth is whole millimetres, else 32FC1. millimetres: rounded, always 16UC1, 0 beyond 65 m."""
+    """exact: 16UC1 if depth is in whole millimetres, else 32FC1. millimetres: rounded, always 16UC1, 0 beyond 65 m."""
     compression: Literal["none", "lz4", "zstd"] = "lz4"
-    """Of the file: from the least time to the least space."""
+    """Compression of the file, in order from least time to least space."""
     chunk_bytes: int = 8 << 20
     """Size of the file's chunks before compression."""
     flush_s: float = 0.5
-    """Seconds after which a chunk is written though it is not full; a killed recorder loses no more."""
+    """Seconds after which a chunk is written even if it is not full. A killed recorder loses no more than that."""
     waiting: int = 60
-    """Frames and messages that may wait for the writer; two seconds of a camera."""
+    """Frames and messages that may wait for the writer; 60 are two seconds of a camera."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.jpeg_quality <= 100:

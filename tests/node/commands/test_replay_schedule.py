@@ -157,7 +157,7 @@ def test_what_comes_out_otherwise_is_said(
         ({}, ["--config", "{folder}/tracked.yaml"], r"was recorded with configuration .* --config and --method"),
         ({"config_hash": "{before}"}, [], r"was recorded by Farside before 0\.2\.0, .* record it again"),
         ({"object_id": 9}, [], "has nothing in this range whose inference can be repeated"),
-        ({}, ["--object", "2"], "has no schedule for object 2; leave --schedule away"),
+        ({}, ["--object", "2"], "has no schedule for object 2; omit --schedule"),
         ({}, ["--from", "5"], "has no frame from 5 s on; it runs from 0 to 0.000 s"),
     ],
 )
@@ -183,7 +183,7 @@ def test_what_cannot_be_repeated_is_named(
 
 def test_a_log_without_schedule_says_so(session: Session, capsys: pytest.CaptureFixture) -> None:
     assert main(["replay", "--schedule", "--prior", str(session[0] / "tiny.safetensors")]) == 1
-    assert "shipped.mcap has no schedule; leave --schedule away" in one_line(capsys.readouterr().err)
+    assert "shipped.mcap has no schedule; omit --schedule" in one_line(capsys.readouterr().err)
 
 
 def test_record_takes_a_part_of_a_log(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
