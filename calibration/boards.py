@@ -80,7 +80,7 @@ class Board:
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]] | None:
         """Corners seen in a picture (RGB or grey): board frame (m) and pixels (x, y); None if the board is not found.
 
-        A chessboard is found whole or not at all, a ChArUco board from any part with 8 corners that are not in a line.
+        A chessboard must be fully visible. Of a ChArUco board, any 8 corners that are not in a line suffice.
         """
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if self.kind == "charuco":

@@ -1,4 +1,4 @@
-"""Intrinsics from views of a board: the fit, its uncertainty, and when it must not be used. Knows no source."""
+"""Intrinsics from views of a board: the fit, its uncertainty, and reasons not to use it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from foundation.one_line import one_line
 
 Model = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 _COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
-# No corner detector does better; it keeps a fit without any residual from claiming certainty.
+# No corner detector is more accurate. It keeps a fit without residuals from reporting zero uncertainty.
 _LEAST_NOISE_PX = 0.01
 
 
@@ -21,7 +21,7 @@ _LEAST_NOISE_PX = 0.01
 class CalibrateConfig:
     """When a view is left out, and the conditions for saving a calibration."""
 
-    fewest_views: int = 3  # Zhang's method needs two for a pinhole without lens; one more tells that they agree
+    fewest_views: int = 3  # Zhang's method needs two for a pinhole without distortion; a third checks that they agree
     most_views: int = 60  # of a long recording, evenly spaced
     least_motion: float = 0.01  # of the picture's diagonal; a view whose corners moved less than this adds nothing
     stream_motion: float = 0.03  # the same, in a stream of pictures: a hand holds the board before a camera
@@ -103,8 +103,8 @@ def calibrate(
 
     Least squares over the intrinsics and the board's poses (Zhang 2000; OpenCV). Views that fit badly are left out one
     by one, the worst first, though never more than half. Standard deviations are those of least squares at the
-    solution, for independent noise of the corners as large as the residuals. What makes the result unusable stands in
-    `trouble`.
+    solution, for independent noise of the corners as large as the residuals. Reasons not to use the
+    result are in `trouble`.
     Raises ValueError if the views are too few or no camera fits at all.
     """
     config = config or CalibrateConfig()
@@ -198,7 +198,7 @@ def _deviations(
     """Standard deviations of the intrinsics for noise of 1 px: the root of the diagonal of (J^T J)^-1, poses marginal.
 
     Each view's derivatives by the intrinsics are reduced to what its own pose cannot imitate. OpenCV inverts the whole
-    by a pseudo-inverse, which gives 0 where a parameter is not determined at all; here it is very large.
+    by a pseudo-inverse, which gives 0 for a parameter that is not determined; here it is very large.
     """
     reduced = []
     for inner, outer in jacobians:
@@ -213,7 +213,7 @@ def _deviations(
 def tilts(views: Sequence[FittedView]) -> Float[np.ndarray, "v 2"]:
     """How the board leans in each view (degrees): its right side away from the camera, and its lower side away.
 
-    Against the plane of the picture, in its axes: two boards with the same tilts tell the same about the focal length.
+    Against the plane of the picture, in its axes: boards with equal tilts give equal information on the focal length.
     """
     normals = np.array([f.T_camera_board[:3, 2] for f in views]).reshape(-1, 3)
     normals = normals * np.where(normals[:, 2:] < 0, -1.0, 1.0)  # away from the camera

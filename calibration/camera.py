@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-# Lengths of OpenCV's distortion vector that each ROS model name stands for.
+# Lengths of OpenCV's distortion vector for each ROS model name.
 _DISTORTION_LENGTHS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 # Undistortion is iterative; OpenCV's default of 5 steps leaves up to a pixel at the corners of a wide lens.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)

@@ -16,7 +16,7 @@ _OURS = "farside_calibration"
 
 
 def write_camera(path: Path, camera: Camera, name: str = "camera") -> None:
-    """Write a camera to YAML, whole or not at all; `read_camera` returns it exactly.
+    """Write a camera to YAML atomically; `read_camera` returns it exactly.
 
     Keys are those of ROS's camera_calibration_parsers. The standard deviations and the RMS (px) are under a key of our
     own.

@@ -70,7 +70,7 @@ def _drawn(width: float, height: float, dark: Float[np.ndarray, "n 4"], note: st
         Outline.unit_rectangle().transformed(Affine2D().scale(x1 - x0, y1 - y0).translate(x0, y0))
         for x0, y0, x1, y1 in dark
     ]
-    # One path, so that no seam shows where two touch; not snapped to pixels, so that no edge is rounded away.
+    # One path, so that no seam shows between neighbours. Not snapped to pixels, so that no edge is rounded.
     axes.add_patch(PathPatch(Outline.make_compound_path(*rectangles), color="black", linewidth=0, snap=False))
     axes.text(_MARGIN, height - _MARGIN - 2.0, note, fontsize=8)
     return figure

@@ -1,8 +1,8 @@
 """A turntable on a serial line, driven with G-code as grbl 1.1 understands it: one command, one answer.
 
 grbl answers each line with `ok` or `error:N`; `?` is answered at once with a report such as `<Idle|MPos:90.000,0,0>`.
-A G-code line is answered when it is queued, not when the motion is over: that is seen by polling until Idle at the
-angle that was asked for.
+A G-code line is answered when it is queued, not when the motion is over. The end of the motion is found by polling
+until the state is Idle at the commanded angle.
 """
 
 import itertools
@@ -17,7 +17,7 @@ from serial.tools import list_ports
 
 from foundation.one_line import one_line
 
-# grbl's own words (doc/csv of grbl 1.1) for what a turntable can meet; others are given by number.
+# grbl's texts (doc/csv of grbl 1.1) for errors of a turntable; others are reported by number.
 ERRORS = {
     1: "G-code words consist of a letter and a value. Letter was not found.",
     2: "Missing the expected G-code word value or numeric value format is not valid.",
@@ -65,7 +65,7 @@ class TurntableConfig:
     speed: float = 30.0
     """Degrees per second."""
     tolerance: float = 0.5
-    """Degrees between the angle asked for and the one reported that still count as arrived."""
+    """Largest difference, degrees, between commanded and reported angle that counts as arrived."""
     baud: int = 115_200
     """Bits per second of the serial line."""
     open_timeout: float = 8.0
@@ -94,7 +94,7 @@ class TurntableStatus:
 
 
 def ports() -> list[str]:
-    """Serial ports of this machine, each with what is plugged in there."""
+    """Serial ports of this machine, each with a description of its device."""
     return [f"{port.device} ({port.description})" for port in sorted(list_ports.comports())]
 
 
@@ -102,7 +102,7 @@ class Turntable:
     """An open turntable: `with Turntable("/dev/ttyUSB0") as table: table.move_to(90.0)`.
 
     Every method raises TurntableError where the line or the controller fails; none waits without limit. `garbage`
-    counts the bytes that were no answer of grbl's: a few are tolerated, many tell of a wrong baud rate.
+    counts received bytes that are not an answer of grbl. A few are tolerated; many indicate a wrong baud rate.
     """
 
     def __init__(self, port: str | None, config: TurntableConfig | None = None):
@@ -178,9 +178,9 @@ class Turntable:
         self._command(f"G92{self.config.axis}0", self.config.reply_timeout)
 
     def move_to(self, angle: float) -> None:
-        """Turn to `angle` (degrees) and return when the table stands there."""
+        """Turn to `angle` (degrees) and return when the table has stopped there."""
         if not abs(angle) < 1e6:
-            raise ValueError(f"a turn to {angle} degrees was asked for; give a finite angle")
+            raise ValueError(f"the angle is {angle} degrees; give a finite one")
         config = self.config
         before = self.status()
         self._refuse_unready(before.state)
@@ -226,7 +226,7 @@ class Turntable:
         raise self._silent(repr(text))
 
     def _wait_idle(self, angle: float | None, timeout: float) -> None:
-        """Poll until the table stands, at `angle` where one is given (right after `ok` it may not have begun)."""
+        """Poll until the table has stopped, at `angle` if given (right after `ok` the motion may not have begun)."""
         deadline, still = time.monotonic() + timeout, 0
         while True:
             status = self.status()

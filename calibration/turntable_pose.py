@@ -38,7 +38,7 @@ def T_board_plate(board: Board) -> Float[np.ndarray, "4 4"]:
 
 
 def locate_plate(board: Board, camera: Camera, rgb: UInt8[np.ndarray, "h w 3"]) -> PlatePose:
-    """The camera's place over the plate in one picture. Raises PlateNotFoundError, which says what was seen instead."""
+    """The camera's pose over the plate in one picture. Raises PlateNotFoundError, which says what was seen instead."""
     corners = board.find(rgb)
     if corners is None:
         raise PlateNotFoundError(
@@ -98,8 +98,8 @@ def turned(T_plate_first: Float[np.ndarray, "4 4"], T_plate_second: Float[np.nda
 def plate_axis(T_plate_cameras: Float[np.ndarray, "n 4 4"]) -> tuple[Float[np.ndarray, "2"], float]:
     """Where the plate's axis meets it (x, y in the plate frame, m), and the rms by which cameras leave their circle.
 
-    The camera stands still, so that in the plate frame its places lie on a circle round the axis. Raises ValueError
-    if they do not tell one: fewer than three, or all close together.
+    The camera does not move, so in the plate frame its positions lie on a circle around the axis. Raises ValueError
+    if they do not determine it: fewer than three, or all close together.
     """
     places = np.asarray(T_plate_cameras, np.float64)[:, :2, 3]
     centred = places - places.mean(axis=0)

@@ -21,12 +21,12 @@ from perception.sources.open_source import open_source
 from perception.sources.pictures import Picture, open_pictures
 
 _MOST_NAMED = 8  # views left out that are listed one by one
-_ADVISE_AFTER = 5  # views kept of a stream: then it is said which to take next
+_ADVISE_AFTER = 5  # kept views of a stream between two hints for the next view
 
 
 @dataclass
 class Found:
-    """What a search for the board has found until now."""
+    """What a search for the board has found so far."""
 
     size: tuple[int, int] | None = None  # width and height of the pictures, px
     views: list[BoardView] = field(default_factory=list)
@@ -80,10 +80,10 @@ def find_views(
     options: Calibrate,
     config: CalibrateConfig,
 ) -> Found:
-    """Views of the board. Of a stream (`total` is None) those that differ, told as they come, and the next to take.
+    """Views of the board. From a stream (`total` is None) only views that differ; they are printed, with hints.
 
-    Ctrl-C ends the search, as does a camera that is lost, and what was found counts. Raises ValueError if pictures
-    differ in size, or none shows the board.
+    Ctrl-C or a lost camera ends the search; the views found until then are returned. Raises ValueError if pictures
+    differ in size, or if none shows the board.
     """
     source, found, first = options.source, Found(), ""
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=24), TimeElapsedColumn())
@@ -128,7 +128,7 @@ def find_views(
 def _look(
     picture: Picture, board: Board, found: Found, err: Console, options: Calibrate, stream: CalibrateConfig | None
 ) -> None:
-    """Look for the board in one picture; in one of a stream, keep it only if it adds something, and say so."""
+    """Look for the board in one picture. Of a stream, keep and print only a view that differs from the others."""
     corners = board.find(picture.rgb)
     if corners is None:
         found.unseen.append(picture.name)
@@ -147,7 +147,7 @@ def _look(
 
 
 def _advice(found: Found, options: Calibrate, config: CalibrateConfig) -> str:
-    """What the views cover until now, and which to take next."""
+    """What the views cover so far, and which view to take next."""
     assert found.size is not None
     try:
         result = calibrate(distinct(found.views, found.size, config)[0], found.size, options.model, config)
@@ -220,7 +220,7 @@ def _first_camera(source: Path) -> Camera:
 
 
 def print_target(path: Path, board: str | None, paper: Paper, out: Console) -> None:
-    """Write a page with the board, and say how to print it."""
+    """Write a page with the board, and print how to print it to scale."""
     named = parse_board(board or DEFAULT_BOARD)
     write_target(path, named, paper)
     out.print(f"  {path}", highlight=False, soft_wrap=True)

@@ -40,14 +40,14 @@ _SMALLEST = 0.0005  # share of a picture that an object fills at least
 
 @dataclass
 class Session:
-    """What capture.json says of an instance's folder: the settings, which a resumed run shares, and what was found."""
+    """Content of capture.json in an instance's folder: the settings, which a resumed run shares, and the results."""
 
     folder: Path
     board: str
     views: int
     side: int = 0  # px
     focal: float = 0.0  # px
-    low: list[float] = field(default_factory=list)  # m, plate frame: the object's bounds where depth told them
+    low: list[float] = field(default_factory=list)  # m, plate frame: the object's bounds measured by depth
     high: list[float] = field(default_factory=list)
 
     @property
@@ -56,12 +56,12 @@ class Session:
         return self.folder / "capture.json"
 
     def save(self) -> None:
-        """Write the file as a whole, or not at all."""
+        """Write the file atomically."""
         content = {key: value for key, value in vars(self).items() if key != "folder"}
         write_whole(self.path, json.dumps(content, indent=1) + "\n")
 
     def missing(self) -> list[int]:
-        """Views that are not there yet, in order."""
+        """Views that are not captured yet, in order."""
         return [i for i in range(self.views) if not all(path.is_file() for path in self.files(i))]
 
     def files(self, index: int) -> tuple[Path, Path]:
@@ -100,9 +100,9 @@ def open_session(options: Capture) -> Session:
 
 
 class FreshFrames:
-    """Frames of a source that were taken after one asked for them: those that waited in a queue are passed over.
+    """Frames of a source that were taken after the call of `take`. Older frames from a queue are skipped.
 
-    Stamps are compared with the time that went by here since the first frame, so the two clocks need not agree.
+    Stamps are compared with the time elapsed here since the first frame, so the two clocks need not agree.
     """
 
     def __init__(self, source: Source, clock: Callable[[], int] = time.monotonic_ns):
@@ -125,14 +125,14 @@ class FreshFrames:
     def _next(self) -> Frame:
         frame = next(self._frames, None)
         if frame is None:
-            raise OSError("the source has no more frames; give one that goes on, such as a live camera")
+            raise OSError("the source has no more frames; give one that does not end, such as a live camera")
         return frame
 
 
 def capture(options: Capture, out: Console, err: Console) -> bool:
-    """Capture what `options.views` asks for and is not there yet. False after Ctrl-C, with what was taken in order.
+    """Capture the views of `options.views` that are missing. Returns False after Ctrl-C; the views taken are complete.
 
-    Raises ValueError or OSError with one line; views taken until then are kept, and the same command goes on.
+    Raises ValueError or OSError with one line. Views taken until then are kept; the same command continues.
     """
     board, session = parse_board(options.board), open_session(options)
     if board.kind != "charuco":
@@ -166,7 +166,7 @@ def capture(options: Capture, out: Console, err: Console) -> bool:
                     progress.update(bar, advance=trouble is None)
         finished = True
     except KeyboardInterrupt:
-        out.print("stopped; the same command goes on with the views that are missing", highlight=False)
+        out.print("stopped; the same command continues with the missing views", highlight=False)
     finally:
         taken = session.views - len(session.missing())
         if taken:
@@ -189,7 +189,7 @@ def _take(
     background: np.ndarray | None,
     options: Capture,
 ) -> str | None:
-    """Write one view; or say why it could not be had."""
+    """Write one view. Returns None, or why it could not be taken."""
     trouble = ""
     for _ in range(1 + max(options.retakes, 0)):
         time.sleep(options.settle)
@@ -240,7 +240,7 @@ def _write_intrinsics(session: Session, board: Board, bounds: np.ndarray | None)
 
 
 def _finish(session: Session, board: Board, garbage: int, skipped: list[int], out: Console) -> None:
-    """Fit the cube to all views, and say what there is."""
+    """Fit the cube to all views, and print a summary."""
     picture, pose = session.files(0)
     for path in [*picture.parent.glob("*.png"), *pose.parent.glob("*.txt")]:  # halves of a view that was cut off
         if not all(p.is_file() for p in (picture.with_stem(path.stem), pose.with_stem(path.stem))):

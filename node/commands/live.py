@@ -1,7 +1,7 @@
 """`farside live`: frames in from a camera, hypotheses out to the bus, the page and a recording, until Ctrl-C.
 
-Three things happen at once, and none waits for another: a reader takes every frame from the camera; a keeper records
-every frame and hands it to whoever listens on the bus; this thread infers from the newest frame there is.
+Three threads run in parallel and do not wait for each other. A reader takes every frame from the camera. A keeper
+records every frame and publishes it on the bus. This thread infers from the newest frame.
 """
 
 import math
@@ -155,7 +155,7 @@ class _Keeper:
 
 
 class LiveNode:
-    """Infers from the newest frame, and tells everybody what is known."""
+    """Infers from the newest frame and publishes the results."""
 
     def __init__(
         self,
@@ -198,15 +198,15 @@ class LiveNode:
                 self._trouble(str(error))
 
     def _kept(self, frame: Frame) -> bool:
-        """What is inferred must be in the recording; a frame that was dropped there is passed over."""
+        """Whether the recording has the frame. A frame that the recording dropped is not used for inference."""
         until = time.monotonic() + 0.5
         while not self.keeper.has(frame) and time.monotonic() < until:
             time.sleep(0.005)
         return self.keeper.has(frame)
 
     def take(self, frame: Frame, out: Console) -> None:
-        """One frame: what is known of its objects at once, then what it adds to them."""
-        if self.config.source == "topic":  # of a driver's frames, those that hypotheses come of are told again
+        """Process one frame: first publish its objects' present hypotheses, then infer what the frame adds."""
+        if self.config.source == "topic":  # publish again the driver's frames that are inferred from
             self.announcer.frame(frame)
         try:
             segments = segment(frame, None, self.config.segment)
@@ -248,7 +248,7 @@ class LiveNode:
                 highlight=False,
                 soft_wrap=True,
             )
-            if h.result == StopReason.INTERRUPTED:  # the sampler took the Ctrl-C, which is meant for the whole node
+            if h.result == StopReason.INTERRUPTED:  # the sampler caught a Ctrl-C meant for the whole node
                 raise KeyboardInterrupt
 
     def _publish(self, frame: Frame, segments: dict[int, Segment]) -> None:
@@ -273,7 +273,7 @@ class LiveNode:
         self.recorder.write_raw(HYPOTHESES_TOPIC, HYPOTHESES, definition(HYPOTHESES), data, h.stamp_ns)
 
     def _trouble(self, text: str) -> None:
-        """Say what is wrong with a frame once, and count it."""
+        """Print a problem with a frame once, and count it."""
         kind = "".join(c for c in text if not c.isdigit())
         self._said[kind] = self._said.get(kind, 0) + 1
         if self._said[kind] == 1:

@@ -272,13 +272,13 @@ class Capture:
     """Turn an object on a turntable and keep posed pictures of it, for `farside train --data`; resumes after a stop."""
 
     source: Annotated[str | None, arg(metavar="SOURCE", help_behavior_hint="(required)")] = None
-    """Where frames come from: a live camera, or whatever else `farside` opens."""
+    """Source of frames: a live camera, or any other source of `farside`."""
     port: Annotated[
         str | None, arg(metavar="PORT", help_behavior_hint="(required; without it the ports are listed)")
     ] = None
     """Serial port of the turntable (grbl 1.1), such as /dev/ttyUSB0."""
     out: Annotated[Path, arg(metavar="DIR")] = Path("captured")
-    """Folder of the data set, one folder for each object."""
+    """Folder of the data set, with one subfolder per object."""
     instance: Annotated[str, arg(metavar="NAME")] = "object"
     """Name of this object."""
     views: Annotated[int, arg(metavar="N")] = 36
@@ -287,7 +287,7 @@ class Capture:
     """ChArUco board on the plate: squares, square and marker in m, dictionary; `farside calibrate --print-target`
     prints it. Place objects of one kind the same way round: the board's right is the front."""
     background: Annotated[Path | None, arg(metavar="FILE.png", help_behavior_hint="(default: white)")] = None
-    """Picture of the empty plate, board in view, from where the camera stands; read only where there is no depth."""
+    """Picture of the empty plate, board in view, from where the camera stands; used only without depth."""
     home: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Turn to the limit switch first; otherwise the present angle is 0."""
     unlock: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -295,7 +295,7 @@ class Capture:
     retakes: Annotated[int, arg(metavar="N")] = 2
     """How often a view is taken again when the board is not found, before it is skipped."""
     settle: Annotated[float, arg(metavar="SECONDS")] = 0.3
-    """Rest before each picture."""
+    """Pause before each picture."""
     table: tyro.conf.OmitArgPrefixes[TurntableConfig] = field(default_factory=TurntableConfig)
 
 
@@ -308,7 +308,7 @@ class Training:
     preset: Literal["small", "paper", "tiny"] = "small"
     """Sizes of the model: small for two CPU cores, the paper's, or tiny for a trial."""
     start: Path | None = None
-    """Weights to go on from, of the same preset; give --frozen-steps with it. Random ones by default."""
+    """Initial weights, of the same preset; give --frozen-steps with it. Random by default."""
     objects: int = 40_000
     """Training objects: the first seeds of the family."""
     pictured: int = 4_000

@@ -176,8 +176,8 @@ def publish(
 
 
 def _clear_others(folder: Path, path: Path, same: Hypotheses | None, out: Console) -> None:
-    """Remove results of earlier runs beside `path`: a folder's answer is joint over one frame. With `same` (one object
-    was asked for) only those of other frames.
+    """Remove results of earlier runs beside `path`: a folder's objects must be of one frame. With `same` (one object
+    inferred) remove only those of other frames.
     """
     for other in sorted(folder.glob("object_*.npz")):
         if other == path or not re.fullmatch(r"object_\d+\.npz", other.name):

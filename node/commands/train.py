@@ -38,7 +38,7 @@ def train(options: Training, out: Console, err: Console) -> bool:
     Raises ValueError if the folder holds another recipe, FloatingPointError if the loss is not finite.
     """
     preset, config, folder = PRESETS[options.preset], options.recipe, options.out
-    if options.data is not None:  # there is no phase in which a decoder could learn first
+    if options.data is not None:  # there is no phase that trains only the decoder
         config = replace(config, solid_steps=0, ray_learning_rate=config.learning_rate)
     if not 1 <= options.objects <= len(TRAIN_SEEDS):
         raise ValueError(f"--objects is {options.objects}; give 1 to {len(TRAIN_SEEDS)}")
@@ -61,7 +61,7 @@ def train(options: Training, out: Console, err: Console) -> bool:
                 text = "steps  " + "  ".join(f"{k} {v:.4g}" for k, v in metrics.items() if k != "step")
                 progress.update(steps, completed=int(metrics["step"]), description=text)
     except KeyboardInterrupt:
-        out.print("stopped; the same command goes on from the last checkpoint", highlight=False)
+        out.print("stopped; the same command continues from the last checkpoint", highlight=False)
         return False
     finally:
         if history.is_file() and (lines := history.read_text(encoding="utf-8").splitlines()):
@@ -83,7 +83,7 @@ def train(options: Training, out: Console, err: Console) -> bool:
 
 
 def _material(options: Training, size: int, progress: Progress) -> tuple[Solids | None, ViewSet, dict[str, Any]]:
-    """The training data, and what the weights' metadata say about it."""
+    """The training data, and their description for the weights' metadata."""
 
     def advance(task: TaskID) -> Callable[[int, int], None]:
         return lambda done, total: progress.update(task, completed=done, total=total)

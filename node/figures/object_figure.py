@@ -29,7 +29,7 @@ _DISAGREEMENT, _OCCUPIED = "RdPu", "OrRd"
 
 def draw_object(path: Path, h: Hypotheses, frame: Frame | None = None, segment: Segment | None = None) -> None:
     """One object in one picture (PNG): view and pixel statuses, hypotheses from the camera and from behind, where they
-    disagree, and what they say about the space that the camera could not see. Without a frame, the hypotheses alone.
+    disagree, and their p_occupied of unseen space. Without a frame, only the hypotheses.
     """
     figure = Figure(figsize=(15.5, 9.9), dpi=100, facecolor="white")
     axes = figure.subplots(3, SHOWN + 1, gridspec_kw={"wspace": 0.06, "hspace": 0.17})
@@ -82,7 +82,7 @@ def draw_training(path: Path, history: list[dict[str, float]]) -> None:
 
 
 def shown(h: Hypotheses, count: int) -> tuple[Int[np.ndarray, "k"], Float[np.ndarray, "k"]]:
-    """Up to `count` hypotheses that stand for all, and the share of the weight that each stands for.
+    """Up to `count` hypotheses that represent all, and the share of the weight that each one represents.
 
     Those with a hidden part that sticks out (`sticks_out`) and those without are shown by their weight, one of each at
     least: they are what differs most for a planner, and `representatives` alone may pass over a thin part.
@@ -101,7 +101,7 @@ def shown(h: Hypotheses, count: int) -> tuple[Int[np.ndarray, "k"], Float[np.nda
 def representatives(
     solid: Bool[np.ndarray, "S G G G"], weights: Float[np.ndarray, "S"], count: int
 ) -> tuple[Int[np.ndarray, "k"], Float[np.ndarray, "k"]]:
-    """Up to `count` hypotheses that stand for all of them, and the share of the weight that each stands for.
+    """Up to `count` hypotheses that represent all of them, and the share of the weight that each one represents.
 
     Greedy k-medoids: each next one lowers most the weighted sum of distances (1 - intersection over union) to the
     nearest representative; a hypothesis counts for its nearest. The heaviest group comes first.

@@ -17,7 +17,7 @@ SHOWN = 100  # points, each on a line
 def answer(
     scene: Sequence[Hypotheses], region: Region, frame: FrameName, risk: float, as_json: bool, out: Console
 ) -> None:
-    """Ask the objects of a scene about a region and print the answer, with a verdict at `risk`.
+    """Query the objects of a scene about a region and print the answer, with a verdict at `risk`.
 
     Raises ValueError in one line.
     """

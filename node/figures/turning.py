@@ -19,9 +19,9 @@ _COLOURS = 160  # of the palette that all frames share
 
 
 def draw_turning(path: Path, h: Hypotheses, frame: Frame | None = None, steps: int = 36) -> None:
-    """One turn of `steps` pictures. Surface that the camera saw is grey, all other is orange.
+    """One turn of `steps` pictures. Surface that the camera saw is grey, the rest is orange.
 
-    Each shape stands for a share of the weight (`shown`). Without `frame` the view is left out.
+    Each shape represents a share of the weight (`shown`). Without `frame` the view is left out.
     """
     index, shares = shown(h, SHOWN)
     labels = [f"{100 * share:.0f}% of the weight" for share in shares]

@@ -66,9 +66,9 @@ def _viewpoint(position: Float[np.ndarray, "3"], size: int) -> Viewpoint:
 
 
 def look_up(image: np.ndarray, camera: Camera, frame: ObjectFrame, view: Viewpoint, outside: float) -> np.ndarray:
-    """What a frame's picture (or map) shows along the viewpoint's rays: a crop, turned to the cube's centre.
+    """A frame's picture (or map) resampled along the viewpoint's rays: a crop, rotated to the cube's centre.
 
-    Only for a viewpoint at the camera's own place, where a turn moves no parallax. `outside` fills what is beyond the
+    Only for a viewpoint at the camera's position, where a rotation has no parallax. `outside` fills pixels beyond the
     picture.
     """
     rays = view.directions @ frame.T_camera_object[:3, :3].T

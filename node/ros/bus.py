@@ -45,7 +45,7 @@ class Publisher:
 
     @property
     def wanted(self) -> bool:
-        """Whether there is a subscriber, or a late one may want the last message."""
+        """Whether there is a subscriber, or the topic is latched for late ones."""
         return self.latched or bool(self._publisher.matching_status.matching)
 
     def publish(self, message: Any) -> bool:
@@ -86,7 +86,7 @@ class Bus:
         self.config = config or BusConfig()
         self.counts = MessageCounts(say or (lambda line: print(f"farside: {line}", file=sys.stderr)))
         self._entities = 0
-        self._tokens: list[str] = []  # our own, which a router does not tell us
+        self._tokens: list[str] = []  # our own, which a router does not report to us
         self._threads: list[threading.Thread] = []
         self._clients: dict[tuple[str, str], bytes] = {}
         self._sequence = 0

@@ -70,7 +70,7 @@ def types() -> Typestore:
 def _mended(definitions: Any) -> Any:
     """Field definitions as ROS 2 has them.
 
-    ROS 2 writes `char`, means uint8, and hashes it so; rosbags 0.11 has a type of its own for it. Also, rosbags puts
+    ROS 2 writes `char`, means uint8, and hashes it so; rosbags 0.11 keeps them as different types. Also, rosbags puts
     the parts of a service under srv/msg.
     """
     match definitions:
@@ -94,7 +94,7 @@ def _register(store: Typestore, name: str, text: str) -> None:
 
 
 def register_service(name: str, text: str, store: Typestore | None = None) -> None:
-    """Make a service known by the text of its .srv; `name` is such as example_interfaces/srv/AddTwoInts."""
+    """Register a service by the text of its .srv. `name` is, for example, example_interfaces/srv/AddTwoInts."""
     store = store or types()
     request, _, response = ("\n" + text).partition("\n---")
     _register(store, f"{name}_Request", request)
@@ -150,7 +150,7 @@ def encode(message: Any) -> bytearray:
     kind = message.__msgtype__
     try:
         data: bytearray = types().serialize_cdr(message, kind, little_endian=True).obj  # type: ignore[assignment]
-    except Exception as error:  # generated code: whatever a wrong field gives
+    except Exception as error:  # generated code raises various types for a wrong field
         raise ValueError(f"{kind} cannot be written: {type(error).__name__}: {error}") from None
     if len(data) == 4:
         data.append(0)  # an empty message has one byte
@@ -191,7 +191,7 @@ def pose(T: Float[np.ndarray, "4 4"]) -> Any:
 
 
 def matrix(message: Any) -> Float[np.ndarray, "4 4"]:
-    """The rigid transform of a geometry_msgs/Pose. Raises ValueError if its quaternion is none."""
+    """The rigid transform of a geometry_msgs/Pose. Raises ValueError if its quaternion is invalid."""
     p, q = message.position, message.orientation
     values = np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w], np.float64)
     if not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1.0) > 1e-3:

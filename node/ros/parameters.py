@@ -36,7 +36,7 @@ def serve_parameters(bus: Bus, parameters: Mapping[str, Parameter]) -> None:
         return make(f"rcl_interfaces/srv/{service}_Response", **response)
 
     def listed(request: Any) -> Any:
-        # depth 0: all below a prefix; else so many parts below it
+        # depth 0: all names below a prefix; else names with at most `depth` more parts
         prefixes = [f"{p}." for p in request.prefixes] or [""]
         kept = [
             name

@@ -1,4 +1,4 @@
-"""What the node publishes for each scene: the topics for a planner, a person, and ROS 2's tools."""
+"""The topics that the node publishes for each scene, for planners, people and ROS 2 tools."""
 
 import time
 from collections.abc import Callable, Sequence

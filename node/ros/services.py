@@ -106,7 +106,7 @@ class Answers:
 
     def _frame(self, name: str, objects: Sequence[Hypotheses]) -> FrameName:
         """The frame that a request's frame_id names. Raises ValueError for an unknown one, and for an object's frame if
-        several objects are asked together.
+        the request is about several objects.
         """
         own = [object_frame_id(self.node, h.object_id) for h in objects]
         aliases: dict[str, FrameName] = {"object": "object", "camera": "camera", "world": "world"}

@@ -107,7 +107,7 @@ class TopicSource:
         self._make_frame()
 
     def _settle(self, matches: list[Match[Any, Any]]) -> None:
-        """Keep the newest pair; count what is dropped. The lock is held."""
+        """Keep the newest pair, and count dropped pairs. The caller holds the lock."""
         depth = self.config.depth
         for match in matches:
             found = None if depth is None else match.partners[depth]

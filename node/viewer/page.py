@@ -1,4 +1,4 @@
-"""The page: a scene in 3D in a browser on this machine, with a box to ask about.
+"""The page: a scene in 3D in a browser on this machine, with a box for queries.
 
 Everything is served from and to 127.0.0.1, to the page alone (`page_guard`). `show` may be called from any thread, as
 viser calls back from its own.
@@ -106,7 +106,7 @@ class Page:
         window.set_width(310)
 
     def _build_right(self) -> None:
-        """The box's answer and sizes, the hypotheses, the unseen space, next views, and what is shown."""
+        """Controls: the box's answer and sizes, the hypotheses, the unseen space, next views, and the layers."""
         gui = self._server.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(340)
@@ -164,7 +164,7 @@ class Page:
         self._layers[node].position = T_page_node[:3, 3]
 
     def _redraw(self, *draw: Callable[[], None]) -> None:
-        """What a control does to the scene, if there is one yet."""
+        """Run a control's drawing steps, if there is a scene yet."""
         with self._lock:
             if self._placed is not None:
                 with self._server.atomic():
@@ -172,7 +172,7 @@ class Page:
                         step()
 
     def _answer(self) -> None:
-        """Ask about the box where it is now. Of calls that wait for each other the last ones find it answered."""
+        """Query the box where it is now. A call that waited for another finds its box already answered."""
         with self._lock:
             centre, size = np.array(self._gizmo.position), 1e-3 * np.array([side.value for side in self._sides])
             if self._placed is None or (*centre, *size) == self._asked:
@@ -194,7 +194,7 @@ class Page:
             side.value = round(1e3 * float(metres))
 
     def _look(self, placed: PageScene) -> None:
-        """Stand where both sides of the objects are in sight."""
+        """Move the viewpoint to where both sides of the objects are visible."""
         position, at = scene3d.onlooker(placed)
         self._server.scene.set_up_direction(placed.up)
         cameras: list[Any] = [self._server.initial_camera, *(c.camera for c in self._server.get_clients().values())]

@@ -1,16 +1,16 @@
 """The page's server: viser on 127.0.0.1, with a guard before it.
 
-A browser lets every web site connect to servers on this machine, so that being local protects nothing. Each request,
-HTTP or WebSocket, is checked before viser sees it:
+A browser lets every web site connect to servers on this machine, so a local address alone protects nothing. Each
+request, HTTP or WebSocket, is checked before viser sees it:
 
-- Host must name this machine, at any port (a tunnel may have another). Another name is one that a web site made point
-  here (DNS rebinding).
-- Origin, which a browser sends with every WebSocket, must be the page's own. A program that is no browser sends none,
-  and is admitted.
+- Host must name this machine, at any port (a tunnel may have another). Any other name may be a web site's name that
+  resolves to this machine (DNS rebinding).
+- Origin, which a browser sends with every WebSocket, must be the page's own. Other programs send none and are
+  admitted.
 - With a token, the path must begin with it: other users of this machine do not know it.
 
-The page itself may load nothing from elsewhere, connect nowhere else, and be in no other site's frame: viser's client
-would otherwise show what any `?websocket=` in a link names, with this page's rights.
+The page itself must not load anything from other sites, connect to them, or be framed by them. Without that, viser's
+client would open any server that a link names in `?websocket=`, with this page's rights.
 """
 
 import asyncio
@@ -123,7 +123,7 @@ class _Guard:
                 return await connection.close(1002, f"another version than {viser.__version__}; load the page again")
             try:
                 await handler(connection)
-            except Exception as error:  # viser asserts, and decodes what is no message
+            except Exception as error:  # viser raises various types for an invalid message
                 _LOG.debug("a client is dropped: %r", error)
                 await connection.close(1007, "no message of this page")
 
@@ -160,12 +160,12 @@ def _bytes(text: str) -> bytes:
 
 
 def _drop(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """What a client's message broke is told to who asks for it, without a traceback."""
+    """Log an error caused by a client's message at debug level, without a traceback."""
     _LOG.debug("%s: %r", context["message"], context.get("exception"))
 
 
 def _check_port(port: int) -> None:
-    """viser by itself would take the next free one, and say so at length."""
+    """Raises OSError or ValueError for an unusable port. viser alone would take the next free one instead."""
     if not 0 <= port <= 65535:
         raise ValueError(f"port {port} does not exist; give one of 0 to 65535")
     try:

@@ -17,11 +17,11 @@ from probnerf.types import StopReason
 OCCUPIED = ("#fff1d6", "#fdbb84", "#ef6548", "#990000")  # p_occupied from 0 to 1
 DISAGREEMENT = ("#fde8ee", "#fa9fb5", "#c51b8a", "#49006a")  # entropy from 0 to log 2
 GAIN = ("#c7d7ea", "#08519c")  # expected information gain of a next view, from 0 to the best one's
-SCALES = {  # what the cloud's colours say: their ramp, and the words for it and for its ends
+SCALES = {  # colour scales of the cloud: the ramp, its title and the labels of its ends
     "probability occupied": (OCCUPIED, ("probability that unseen space is occupied", "0", "1")),
     "disagreement": (DISAGREEMENT, ("disagreement: entropy over log 2", "all agree", "evenly split")),
 }
-LAYERS = {  # parts that can be hidden, and their scene nodes
+LAYERS = {  # parts that can be hidden: label, scene node
     "hypothesis": "/shapes",
     "unseen space": "/unseen",
     "seen points": "/seen",
@@ -124,7 +124,7 @@ def state(scene: Sequence[Hypotheses], now_ns: int | None = None) -> str:
 
 
 def views(gains: Sequence[float], entropy: float) -> str:
-    """Ranked next views with their expected information gain, and what there is to be gained at all (nats)."""
+    """Ranked next views with their expected information gain, and the largest possible gain (nats)."""
     lines = [f"<b>{i}</b>&ensp;+{gain:.2f} nats" for i, gain in enumerate(gains, start=1)]
     first = f"expected information gain of a picture from there (of {entropy:.2f} nats at most):"
     return box("<br>".join([first, *lines]))

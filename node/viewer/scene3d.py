@@ -20,7 +20,7 @@ from perception.observation.settings import ObserveConfig
 from perception.sources.frame import Frame
 from probnerf.rendering.occupancy import voxel_centres
 
-AROUND = 2.2  # half extents of its cube: so much of the scene is shown around each object
+AROUND = 2.2  # half extents of its cube; the part of the scene that is shown around each object
 MAX_POINTS = 60_000  # of the seen surface
 BOX_EDGES = np.array(  # of the unit cube about the origin: [12 edges, 2 ends, 3]
     [
@@ -30,12 +30,12 @@ BOX_EDGES = np.array(  # of the unit cube about the origin: [12 edges, 2 ends, 3
     ]
 )
 REACH = TrackConfig().reach  # half extents between an object's cube and that of its segment
-LEAST_P = 0.02  # less probable voxels are not shown at all
+LEAST_P = 0.02  # less probable voxels are not shown
 
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """The frame that a scene was inferred from, and what its pixels say of each object found in it (by id)."""
+    """The frame that a scene was inferred from, and the segment of each object found in it (by id)."""
 
     frame: Frame
     segments: Mapping[int, Segment]
@@ -43,7 +43,7 @@ class CameraView:
 
 @dataclass(frozen=True, eq=False)
 class PageScene:
-    """A scene in the page's frame, ready to be asked in it."""
+    """A scene in the page's frame, ready for queries in that frame."""
 
     objects: tuple[Hypotheses, ...]
     frame: FrameName  # the name of the page's frame in questions to `objects`
@@ -66,10 +66,10 @@ class PageScene:
 
 
 def camera_view(frame: Frame, scene: Sequence[Hypotheses]) -> CameraView:
-    """A frame with the statuses of its pixels for the scene's objects, computed anew with the usual segmentation.
+    """A frame with the statuses of its pixels for the scene's objects, recomputed with the usual segmentation.
 
-    Segments belong to objects by the frame's label map. Without one they are numbered by size, which says nothing about
-    the objects' ids: there a segment belongs to the object at its place. An object without a segment has no statuses.
+    Segments belong to objects by the frame's label map. Without one they are numbered by size, not by the
+    objects' ids; then a segment belongs to the object at its place. An object without a segment has no statuses.
     Raises ValueError if the frame is not the scene's.
     """
     for h in scene:
@@ -118,15 +118,15 @@ def place(scene: Sequence[Hypotheses]) -> PageScene:
         placed = PageScene(tuple(scene), "world", "world", np.asarray(first.T_world_camera))
     elif len(scene) == 1:
         placed = PageScene((first,), "object", f"object {first.object_id}", T_object_camera)
-    else:  # the first object's frame is made the world, because only there may several objects be asked at once
+    else:  # the first object's frame becomes the world: queries about several objects need one
         moved = tuple(replace(h, T_world_camera=T_object_camera) for h in scene)
         placed = PageScene(moved, "world", f"object {first.object_id}", T_object_camera)
-    ask(placed, np.zeros(3), np.full(3, 1e-3))  # raises where the objects do not go together
+    ask(placed, np.zeros(3), np.full(3, 1e-3))  # raises if the objects are not of one frame
     return placed
 
 
 def ask(placed: PageScene, centre: Float[np.ndarray, "3"], size: Float[np.ndarray, "3"]) -> QueryResult:
-    """What all objects together say of an axis-aligned box of the page's frame (m)."""
+    """The joint answer of all objects about an axis-aligned box of the page's frame (m)."""
     centre, size = np.asarray(centre, np.float64), np.asarray(size, np.float64)
     low, high = (tuple(float(v) for v in centre + side * size) for side in (-0.5, 0.5))
     return query(placed.objects, Box(low, high), placed.frame)  # type: ignore[arg-type]
@@ -192,8 +192,8 @@ def cloud(placed: PageScene) -> Cloud:
 
 
 def first_box(placed: PageScene, unseen: Cloud) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Centre and size (m) of a box where the answer is worth reading: the surroundings of space that hypotheses are
-    split about, at about even odds. Rounded to millimetres.
+    """Centre and size (m) of an informative first box: around space that about half of the hypotheses occupy. Both are
+    rounded to millimetres.
     """
     side = 0.3 * placed.objects[0].object_frame.half_extent
     size = np.maximum(np.round(np.full(3, side), 3), 1e-3)
@@ -221,7 +221,7 @@ def seen_surface(placed: PageScene, view: CameraView) -> tuple[Float[np.ndarray,
 
 
 def picture(view: CameraView, object_id: int, tinted: bool) -> UInt8[np.ndarray, "h w 3"]:
-    """The frame's colours, or over them in grey what each pixel says of the object (`shade.STATUS`)."""
+    """The frame's colours, or its grey picture tinted by each pixel's status for the object (`shade.STATUS`)."""
     found = view.segments.get(object_id)
     if not tinted or found is None:
         return view.frame.rgb

@@ -84,7 +84,7 @@ def test_a_stopped_capture_keeps_its_views_and_goes_on(
     folder = tmp_path / "set" / "block"
     with Grbl() as grbl:
         assert run(grbl, views=4, stop_after=3) == 130  # one frame to begin with, then two views
-    assert "2 of 4" in (said := capsys.readouterr().out) and "the same command goes on" in said
+    assert "2 of 4" in (said := capsys.readouterr().out) and "the same command continues" in said
     kept = {path: path.read_bytes() for path in folder.glob("*/*")}
     assert len(read_instance(folder).mask) == 2
     (folder / "rgb" / "000002.png").write_bytes(b"killed while writing")  # and no pose

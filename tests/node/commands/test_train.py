@@ -122,7 +122,7 @@ def test_ctrl_c_leaves_the_curves(tmp_path: Path, trainer: Trainer, capsys: pyte
     trainer.error = KeyboardInterrupt()
     assert run(tmp_path) == 130
     assert (tmp_path / "curves.png").is_file() and not (tmp_path / "prior.safetensors").exists()
-    assert "the same command goes on from the last checkpoint" in capsys.readouterr().out
+    assert "the same command continues from the last checkpoint" in capsys.readouterr().out
 
 
 def test_a_loss_that_is_no_number_is_one_line(tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture) -> None:
