@@ -21,12 +21,12 @@ class AnswerDiagnostics:
     beta: float = NAN  # least inverse temperature of a population; 1: the posterior
     log_evidence: float = NAN  # nats; mean over populations
     log_evidence_se: float = NAN  # nats; its standard error
-    explained: float = NAN  # share of the telling pixels that the shapes explain on average, 0 to 1
+    explained: float = NAN  # share of the informative pixels that the shapes explain on average, 0 to 1
     failed_populations: float = NAN  # count; they never left a poor mode and are left out
     power: float = NAN  # of the likelihood: pixels that one ray counts for
     point_gradients: float = NAN  # count of field evaluations with gradient, in all runs
     evidence_power: float = NAN  # a population's weight is its evidence estimate to this power
-    expected_loss: float = NAN  # nats a voxel of unseen space, for want of more populations (`publish.expected_loss`)
+    expected_loss: float = NAN  # nats per voxel of unseen space, from having few populations (`publish.expected_loss`)
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, float]) -> "AnswerDiagnostics":

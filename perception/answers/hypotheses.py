@@ -1,4 +1,4 @@
-"""Hypotheses: several whole weighted shapes of one object, as a planner reads them.
+"""Hypotheses: several complete, weighted shapes of one object, as a planner reads them.
 
 Everything a query needs is here: no prior and no image. Grids follow `probnerf.rendering.occupancy` (G
 voxels per axis over the cube, index order [i_x, i_y, i_z], view frame); the object frame of `ObjectFrame` is that frame
@@ -46,7 +46,7 @@ class Hypotheses:
     prior_hash: str
     seed: int
     diagnostics: AnswerDiagnostics
-    result: StopReason  # the sampler's (`Posterior.result`), or what kept the controller from a further run
+    result: StopReason  # the sampler's (`Posterior.result`), or why the controller made no further run
 
     def __post_init__(self) -> None:
         shape = self.opacity.shape
@@ -89,7 +89,7 @@ class Hypotheses:
 
     @property
     def base(self) -> Float[np.ndarray, "S"]:
-        """Height in the cube on which each hypothesis stands: the plane's, and the error that it supposes of it."""
+        """Height in the cube on which each hypothesis stands: the plane's height plus the hypothesis's error of it."""
         return BASE_Z + self.pose[:, 4]
 
     @property
@@ -134,7 +134,7 @@ class Hypotheses:
 
     @property
     def alone(self) -> bool:
-        """All but one of the sampler's populations failed, so that nothing tells how far off that one is."""
+        """All but one of the sampler's populations failed, so the error of the last one is unknown."""
         return self.failed > 0 and len(np.unique(self.population)) == 1
 
     def estimate(
@@ -144,8 +144,8 @@ class Hypotheses:
 
         se^2 is the larger of two: within, sum_g W_g^2 (x_g - m)^2 over distinct hypotheses g (that of a
         self-normalised weighted mean), and between, the variance of the mean of the P populations' own estimates,
-        sum_p (m_p - m')^2 / (P (P - 1)) with m' their average. A population counts equally whatever its weight: where
-        populations disagree the answer is uncertain, however sure the heaviest is.
+        sum_p (m_p - m')^2 / (P (P - 1)) with m' their average. Populations count equally, independent of their weights:
+        if they disagree the answer is uncertain, even if the heaviest is certain.
         """
         x = np.asarray(values, np.float64)
         mean = np.tensordot(self.weights, x, 1)
@@ -213,8 +213,8 @@ def mesh(hypotheses: Hypotheses, index: int) -> tuple[Float[np.ndarray, "v 3"], 
     occupied = hypotheses.solid[index]
     if not occupied.any():
         return np.zeros((0, 3)), np.zeros((0, 3), np.int32)
-    # The walls' own opacity places the surface between voxels; all that is solid lies above the level, so that no
-    # inner wall is drawn.
+    # The walls' opacity places the surface between voxels. Every solid voxel is above the level, so that no inner wall
+    # is drawn.
     opacity = hypotheses.opacity[index]
     level = np.where(occupied, np.maximum(opacity, 128), np.minimum(opacity, 127)).astype(np.float32)
     level[..., voxel_centres(hypotheses.grid)[0, 0, :, 2] < min(hypotheses.base[index], BASE_Z)] = 0.0

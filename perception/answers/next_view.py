@@ -1,4 +1,4 @@
-"""Where to look next: candidate cameras ranked by what their picture would tell of which hypothesis is true.
+"""Next views: candidate cameras ranked by how well their picture would tell the hypotheses apart.
 
 A camera at v would measure ranges y. With the hypotheses as the prior (weights w_s), the expected information gain is
 the mutual information I(S; Y_v) between the true shape and the picture. For a mixture it has no closed form; the
@@ -6,8 +6,8 @@ pairwise-distance estimator (Kolchinsky and Tracey, Entropy 19(7):361, 2017, eq.
 
     I = -sum_s w_s log sum_r w_r exp(-C(p_s, p_r)),    C the Bhattacharyya distance of the two pictures' laws,
 
-is a lower bound, exact where the pictures are alike or wholly distinct, and lies in [0, H(S)]. Several objects are
-independent given the frame: their gains add. What one object hides of another is left out.
+is a lower bound, exact if the pictures are equal or completely distinct, and lies in [0, H(S)]. Several objects are
+independent given the frame: their gains add. Occlusion between objects is ignored.
 """
 
 import math
@@ -27,14 +27,14 @@ _HALF = 1.1  # cube units that a picture shows on each side of the cube's centre
 
 @dataclass(frozen=True)
 class NextViewConfig:
-    """Which views are considered, and how much a pixel of one would tell."""
+    """The candidate views, and the model of one pixel's information."""
 
     azimuths: int = 12
     elevations: tuple[float, ...] = (20.0, 45.0, 70.0)  # degrees above the support plane
-    pixels: int = 12  # a side, over the cube; the ranges in it stand for the whole picture's
-    wall_sigma: float = 0.05  # cube units; ranges of one shape differ so much from model to camera
-    mask_error: float = 0.01  # chance that a pixel is taken for object or background wrongly
-    power: float = 0.5  # pixels' errors are not independent: each counts as at most so much
+    pixels: int = 12  # per side, over the cube; their ranges represent the whole picture's
+    wall_sigma: float = 0.05  # cube units; standard deviation of a range between model and camera
+    mask_error: float = 0.01  # probability that object and background are confused in a pixel
+    power: float = 0.5  # pixels' errors are not independent: largest weight of each pixel
     present: float = 0.25  # mean distance of the hypotheses' pictures in the present view, whose information is used up
 
 
@@ -111,8 +111,8 @@ def _gains(
 ) -> Float[np.ndarray, "c"]:
     """I(S; Y) of one object and each camera, nats (the module's equation).
 
-    All hypotheses explain the present view, and another picture from there would share its errors. So its distances,
-    which are those of samples that it cannot tell apart, set the unit in which another view's are counted.
+    All hypotheses explain the present view, and another picture from there would share its errors. So its distances
+    are those of samples that it cannot distinguish. They are the unit for distances in other views.
     """
     words = packed(h.solid)
     present = np.linalg.inv(h.object_frame.T_camera_object)
@@ -138,7 +138,7 @@ def _distances(
     """
     at = T_object_camera[:3, 3] / h.object_frame.half_extent
     distance = max(float(np.linalg.norm(at)), 1e-6)
-    T = look_at(at, np.zeros(3))  # the object is kept in the picture's middle: any camera is turned to it
+    T = look_at(at, np.zeros(3))  # every camera is rotated to have the object in the picture's middle
     _, directions = pinhole_rays(T, 0.5 * config.pixels * distance / _HALF, config.pixels)
     ranges = first_hits(words, len(h.weights), T[:3, 3], directions)
     ranges = ranges[np.isfinite(ranges).any(axis=1)]

@@ -1,6 +1,6 @@
-"""Questions about a region of space, answered from hypotheses alone: offline, on a saved file, long after.
+"""Queries about a region of space, answered from hypotheses only, also offline from a saved file.
 
-Answers are joint: "is the whole region free" is asked of each hypothesis and then averaged, never multiplied over
+Answers are joint: "is the whole region free" is evaluated for each hypothesis and then averaged, never multiplied over
 voxels. Several objects are one scene: given the frame their posteriors are independent, so a scene's hypothesis is one
 of each, and the probability that a region is free of all is the product over *objects* of their joint probabilities.
 """
@@ -50,10 +50,10 @@ class QueryResult:
     def verdict(self, risk: float = 0.05) -> Verdict:
         """Free or occupied where the hypotheses' chance of being wrong is at most `risk` in (0, 0.5), else unsure.
 
-        The chance counts what so few hypotheses can tell: of one object, n effective ones that all agree leave
-        1 / (n + 2) (the rule of succession), so that a risk below that is never answered. Nothing is called free that
-        reaches out of every object's cube, or into the table: nobody looked there. How often such calls are wrong of
-        real unseen space is measured by `farside bench calibration`. Raises ValueError for another risk.
+        The chance accounts for the number of hypotheses: for one object, n effective ones that all agree leave
+        1 / (n + 2) (the rule of succession), so for a smaller risk the verdict is always unsure. A region that extends
+        outside every object's cube, or into the table, is never free: that space was not observed. `farside bench
+        calibration` measures how often verdicts on real unseen space are wrong. Raises ValueError for another risk.
         """
         if not 0.0 < risk < 0.5:
             raise ValueError(f"risk is {risk:g}; give the chance of being wrong that you accept, above 0 and below 0.5")
@@ -144,8 +144,8 @@ def _region_voxels(
     """Flat indices of the object's voxels in the region, and the volume (m^3) of each that lies in it.
 
     A box, cut to the cube, is sampled on a lattice half a voxel wide or finer, at least one sample per axis, so that a
-    thin box still finds its voxels. Points stand for the voxels they fall in. Of swept boxes, each eighth of a voxel
-    counts whose centre lies in one; cells wider than that are cut into such as are not.
+    thin box still finds its voxels. Points select the voxels that contain them. Of swept boxes, each eighth of a voxel
+    counts if its centre lies in one. Cells wider than half a voxel are split first.
     """
     hits = np.zeros(h.grid**3, int)
     if isinstance(region, Points | Cells):
@@ -238,7 +238,7 @@ def _fractions(scene: Sequence[Hypotheses], region: Region, frame: FrameName) ->
 
 
 def _sampled(region: Swept, width: float) -> tuple[Float[np.ndarray, "3 n"], Float[np.ndarray, "n"]]:
-    """Points of the union of boxes, at most `SWEPT_SAMPLES` in all, and the volume that each stands for."""
+    """Points of the union of boxes, at most `SWEPT_SAMPLES` in all, and the volume that each represents."""
     points, shares = [], []
     for k, (T, size) in enumerate(zip(region.T_frame_box, region.size, strict=True)):
         counts = size / width
@@ -285,5 +285,5 @@ def _volume_quantiles(objects: list[tuple[Float[np.ndarray, "S"], Float[np.ndarr
 def _quantile(
     values: Float[np.ndarray, "S"], weights: Float[np.ndarray, "S"], levels: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n"]:
-    # a level met exactly, but for rounding, is met
+    # tolerate rounding where a level is met exactly
     return np.quantile(values, levels - 1e-9, weights=weights, method="inverted_cdf")

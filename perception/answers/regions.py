@@ -1,4 +1,4 @@
-"""Regions that a planner may ask about, metres, in the frame of the question."""
+"""Regions of a planner's queries, metres, in the frame of the query."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,8 +117,8 @@ def read_points(path: str | Path) -> Points:
 
 
 def read_mesh(path: Path, width: float) -> Cells:
-    """What a mesh file (.obj, .stl, .ply, .off, .glb; metres) fills, in its own frame: cells that its surface meets or
-    encloses. A surface with an opening wider than a cell encloses nothing there.
+    """The region of a mesh file (.obj, .stl, .ply, .off, .glb; metres), in its own frame: cells that its surface meets
+    or encloses. A surface with an opening wider than a cell encloses nothing there.
 
     Raises FileNotFoundError, or ValueError if the file holds no triangles or would fill more than `MOST_CELLS`.
     """
@@ -128,7 +128,7 @@ def read_mesh(path: Path, width: float) -> Cells:
         raise FileNotFoundError(f"{path}: no such file; give a mesh (.obj, .stl, .ply, .off or .glb, in metres)")
     try:
         mesh = trimesh.load_mesh(path, process=False)  # processing drops vertices that are not finite
-    except Exception as error:  # whatever a reader of one of its formats meets
+    except Exception as error:  # the formats' readers raise various types
         raise ValueError(f"{path} cannot be read as a mesh ({error}); export it again as .obj, .stl or .ply") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise ValueError(f"{path} holds no triangles; export it as a triangle mesh (points go to --points)")

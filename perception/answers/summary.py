@@ -1,4 +1,4 @@
-"""What a robot's user acts on: an object's size, whether a hidden part sticks out, and where to look next."""
+"""Summary of an object: its size, whether a hidden part sticks out, and where to look next."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -13,14 +13,14 @@ from probnerf.rendering.occupancy import voxel_centres
 
 MARGIN_M = 0.01  # a part counts where it reaches farther than this beyond what was seen
 _ABOVE = 60.0  # degrees; a view from higher is one from above
-_LEAST_GAIN = 0.05  # nats; a next view that promises less is not worth a move
+_LEAST_GAIN = 0.05  # nats; least expected gain of a next view that is suggested
 
 Side = Literal["front", "left", "back", "right"]
 
 
 @dataclass(frozen=True)
 class Direction:
-    """Where a camera stands, relative to the camera that saw the object and the object's upright axis."""
+    """Direction of a camera, relative to the camera that saw the object and the object's upright axis."""
 
     side: Side  # of the object: "front" is the side that was seen, left and right are the picture's
     above: bool  # more than 60 degrees above the support plane
@@ -34,8 +34,8 @@ class Summary:
     size_m: Float[np.ndarray, "3"]  # width (across the picture), depth (along the line of sight) and height
     p_sticks_out: float  # probability that an unseen part reaches more than 1 cm beyond what was seen
     p_sticks_out_se: float  # its Monte Carlo standard error
-    p_least: float  # rule of succession: so few hypotheses cannot support a smaller probability
-    next_view: Direction | None  # None: no view promises to tell much
+    p_least: float  # rule of succession: least probability that the number of hypotheses supports
+    next_view: Direction | None  # None: no view has enough expected gain
 
 
 def summarise(h: Hypotheses) -> Summary:

@@ -1,14 +1,14 @@
-"""How much model a scene needs: from a frame's segment to published hypotheses, with no more than that.
+"""Adaptive inference: from a frame's segment to published hypotheses, with as many sampler runs as the scene needs.
 
-A run is a small sampler: a few independent populations of a few particles, which begin where climbs from the encoder's
-guesses end. How far its populations disagree of unseen space tells what score their small number is expected to lose
-there (`publish.expected_loss`). Where that is above the tolerance the controller makes as many further runs as should
-bring it down (it falls with their number), and their populations answer together; where the shapes leave too many
-pixels unexplained (a posterior-predictive check) it makes all it may. There is an answer to publish from the start, and
-a better one after each step.
+A run is a small sampler: a few independent populations of a few particles. They begin where climbs from the encoder's
+guesses end. From the populations' disagreement about unseen space follows the score that their small number is expected
+to lose there (`publish.expected_loss`). If it is above the tolerance, the controller makes the further runs that should
+reduce it enough (it falls with their number), and pools their populations. If the shapes leave too many pixels
+unexplained (a posterior-predictive check), it makes all allowed runs. An answer can be published from the start, and a
+better one after each step.
 
-Lattice and rays are the same for every scene: with half of both, shapes were worse on easy scenes as on hard ones, and
-no check told where (`farside bench frontier` has a coarse lattice among its levers).
+Lattice and rays are the same for every scene. With half of both, shapes were worse on easy and hard scenes, and no
+check predicted where (`farside bench frontier` can measure a coarse lattice).
 """
 
 import time
@@ -37,7 +37,7 @@ from probnerf.types import Observation, Posterior, StopReason
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Everything known of one object: what is published, and what it was made from."""
+    """The inference result of one object: the published hypotheses and their sources."""
 
     hypotheses: Hypotheses
     posterior: Posterior
@@ -89,7 +89,7 @@ def infer_view(
 ) -> Estimate:
     """Sample the posterior of a view and publish it, in as many runs as it takes (`run_plan.runs_wanted`).
 
-    `before` is a posterior of the same view that was cut short; one run goes on from it. The limits are for all runs
+    `before` is an interrupted posterior of the same view; one run continues from it. The limits are for all runs
     together. A further run that is cut short is left out.
     """
     begun = time.monotonic()
@@ -132,14 +132,14 @@ def infer_view(
 
 @dataclass(eq=False)
 class _Publisher:
-    """Makes hypotheses of a view's samples, and hands out early ones until the first run is whole."""
+    """Makes hypotheses from a view's samples, and publishes early ones until the first run is complete."""
 
     sampler: ViewSampler
     config: ControllerConfig
     callbacks: Callbacks
-    _whole: bool = False  # a run is: no more early answers
-    _early_at: float = field(default_factory=time.monotonic)  # when the last early answer was handed out
-    _early_s: float = 0.0  # what it took to make
+    _whole: bool = False  # a run is complete: no more early answers
+    _early_at: float = field(default_factory=time.monotonic)  # when the last early answer was published
+    _early_s: float = 0.0  # time that it took
 
     def publish_runs(self, runs: list[Posterior]) -> Hypotheses:
         """The answer of several runs together."""
@@ -152,7 +152,7 @@ class _Publisher:
             self.callbacks.on_answer(answer)
 
     def hand_out_guess(self) -> None:
-        """What the encoder takes the object for, if anyone listens who knows nothing better."""
+        """Publish the encoder's guess, if the callbacks want it."""
         if self.callbacks.on_answer is not None and self.callbacks.guess:
             self._hand_out_early(self.sampler.guess())
 
@@ -169,7 +169,7 @@ class _Publisher:
         return None
 
     def log_line(self, found: Findings, failed: int, wanted: int) -> str:
-        """What the runs so far found, in words, and whether more are wanted."""
+        """A log line: the findings of the runs so far, and whether more are wanted."""
         line = f"{self._particles(found.runs)}: "
         known = np.isfinite(found.expected_loss)
         line += f"expected loss {found.expected_loss:.4f} nats" if known else "expected loss not known"

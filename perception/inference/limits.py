@@ -1,4 +1,4 @@
-"""How long inference may go on, and who hears of it meanwhile."""
+"""Limits on inference, and callbacks for its progress."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,13 +10,13 @@ from probnerf.types import StopReason
 
 @dataclass(frozen=True)
 class Limits:
-    """What all runs of the sampler may take together. Without a deadline an answer depends on its inputs alone."""
+    """Limits for all runs of the sampler together. Without a deadline an answer depends only on its inputs."""
 
     deadline: float | None = None  # on the clock of time.monotonic()
     stages: int | None = None
 
     def reached(self, stages: int, now: float, next_run_s: float) -> StopReason | None:
-        """Which limit leaves no room for a further run after so many stages, if that takes `next_run_s` or more."""
+        """The limit that rules out a further run after `stages`, if that takes `next_run_s` or more."""
         if self.stages is not None and stages >= self.stages:
             return StopReason.STAGES
         if self.deadline is not None and now + next_run_s > self.deadline:
@@ -26,11 +26,11 @@ class Limits:
 
 @dataclass(frozen=True)
 class Callbacks:
-    """Who hears of inference while it goes on."""
+    """Callbacks during inference."""
 
     on_stage: Callable[[StageInfo], bool | None] | None = None  # after each stage; True ends sampling
     on_answer: Callable[[Hypotheses], None] | None = None  # each answer, the last one, too
-    guess: bool = True  # `on_answer` also gets what the encoder takes the object for: nothing better is known of it
+    guess: bool = True  # `on_answer` also gets the encoder's guess
 
 
 NO_LIMITS = Limits()

@@ -111,12 +111,12 @@ def _with_error(h: Hypotheses) -> Hypotheses:
 
 
 def expected_loss(h: Hypotheses, region: Bool[np.ndarray, "G G G"]) -> float:
-    """Log score that the answer is expected to lose, nats a voxel of a region, for it has so few populations.
+    """Expected loss of log score from having few populations, nats per voxel of a region.
 
     With independent estimates p_m of a voxel's probability, m = 1 .. M, of mean p and variance s^2, their mean's log
-    score lies s^2 / M / (2 p (1 - p)) below that of p, to second order, if p is right: so much more of them would
-    gain, and it falls with 1 / M. All populations that have weight count alike. Each is known by the shapes of it that
-    are published; the fewer, the more is lost. NaN where there are no two populations.
+    score lies s^2 / M / (2 p (1 - p)) below that of p, to second order, if p is right. More populations could gain that
+    much, and it falls with 1 / M. All populations with weight count equally. Each is represented by its published
+    shapes; the fewer they are, the larger the loss. NaN with fewer than two populations.
     """
     names = np.unique(h.population[h.weights > 0.0])
     if len(names) < 2:

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Findings:
-    """What the runs so far say together."""
+    """Findings of all runs so far together."""
 
     runs: int
-    expected_loss: float  # nats a voxel of unseen space, for want of more populations (NaN: not known)
-    unexplained: float  # share of the telling pixels that the shapes do not explain, 0 to 1
+    expected_loss: float  # nats per voxel of unseen space, from having few populations (NaN: unknown)
+    unexplained: float  # share of the informative pixels that the shapes do not explain, 0 to 1
 
 
 def runs_wanted(found: Findings, most: int, tolerance: float, unexplained: float) -> int:

@@ -1,4 +1,4 @@
-"""Where the time of a job goes."""
+"""Time spent in the parts of a job."""
 
 import time
 from collections.abc import Iterator

@@ -1,10 +1,10 @@
-"""Objects over time: each frame adds to what is known of them, or says that they moved.
+"""Objects over time: each frame adds a view of them, or shows that they moved.
 
 The latents live in the cube of an object's first frame. A later frame of the same still object is observed in that cube
-(its camera moves, its rays with it), and the posterior of all views is inferred afresh: what is left of the one before
-knows fewer modes than a new search finds. What a frame adds is measured by the voxels that it is the first to see. One
-that adds nothing shares its errors with those before it, as pictures from one tripod do: it only has to agree, and the
-answer is published again under its stamp, or gone on with where it was cut short (`populations.start_from`). A frame
+(its camera moves, its rays with it), and the posterior of all views is inferred from the start: the previous samples
+cover fewer modes than a new search finds. What a frame adds is measured by the voxels that it is the first to see. A
+frame that adds nothing has the same errors as those before it, like pictures from one tripod. It only has to agree. The
+answer is then published again under its stamp, or interrupted sampling continues (`populations.start_from`). A frame
 that the hypotheses do not explain shows an object that moved.
 """
 
@@ -34,13 +34,13 @@ from probnerf.types import Observation, Posterior, StopReason, joined, on_device
 
 
 class Change(StrEnum):
-    """What one frame does to what is known of one object."""
+    """The effect of one frame on the knowledge of one object."""
 
     NEW = "new"  # it is seen for the first time
     VIEW = "view"  # it is seen from another side: a further view to condition on
-    CONTINUED = "continued"  # nothing to add; sampling that was cut short goes on
+    CONTINUED = "continued"  # nothing to add; interrupted sampling continues
     SAME = "same"  # nothing to add, and nothing left to sample
-    MOVED = "moved"  # it does not stand where it stood: begun anew
+    MOVED = "moved"  # it is no longer where it was: inference restarts
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,15 +82,15 @@ class Look:
     object_id: int  # the object's own, which stays from frame to frame
     change: Change
     agreement: float
-    hypotheses: Hypotheses | None  # what is known of it already, under this frame's stamp; None: nothing that holds
+    hypotheses: Hypotheses | None  # earlier ones that still hold, under this frame's stamp; None: there are none
     seed: int
     _view: ConditionedView
     _kept: tuple[_Kept, ...]
-    _track: _Track | None  # that is gone on from
+    _track: _Track | None  # the track that is continued
 
     @property
     def builds_on(self) -> bool:
-        """Whether inference continues from what is known of the object."""
+        """Whether inference continues from the object's earlier views or samples."""
         return self.change in (Change.VIEW, Change.CONTINUED)
 
     @property
@@ -126,11 +126,11 @@ class Tracker:
     def look(
         self, frame: Frame, segment: Segment, how: Callable[[int], tuple[int, bool] | None] | None = None
     ) -> Look | None:
-        """Hold a frame's segment against what is known.
+        """Compare a frame's segment with the tracked objects.
 
-        `how` maps the object's id to the seed of what is drawn for this frame and whether to begin anew; where it
-        answers None, so does this. Without it the seed is the tracker's own and the number of the inference. Raises
-        ValueError where the segment cannot be observed, as `observe` does.
+        `how` maps the object's id to this frame's seed and whether to start afresh. If it returns None, so does this.
+        Without it the seed is the tracker's seed plus the number of the inference.
+        Raises ValueError if the segment cannot be observed, as `observe` does.
         """
         found = object_frame(frame, segment, self.config.observe)
         name = self._name(frame, segment, found)
@@ -157,8 +157,8 @@ class Tracker:
         return Look(name, change, agreement, None, seed, view, (_Kept(observation, _direction(found)),), None)
 
     def infer(self, look: Look, limits: Limits = NO_LIMITS, callbacks: Callbacks = NO_CALLBACKS) -> Update:
-        """Sample what a look left to infer, and keep the result. If something is known of the object already, the
-        encoder's guess is not handed out.
+        """Do the sampling that a look requires, and store the result. If the object has hypotheses already, the
+        encoder's guess is not published.
         """
         track = look._track
         if look.settled and track is not None and look.hypotheses is not None:

@@ -59,14 +59,14 @@ class ViewSampler:
 
     @property
     def asks_encoder(self) -> bool:
-        """Whether there is an encoder to ask where the object's modes may be."""
+        """Whether an encoder can guess where the object's modes are."""
         tempers_anew = self.config.method == "tempered_smc" and self.before is None
         return tempers_anew and asks_encoder(self.config, self.prior.model, self._picture)
 
     @cached_property
     def _picture(self) -> EncoderPicture | None:
-        """What the encoder sees. Without the ranges that it was trained with there is none, nor where the pose is known
-        (guesses at one yaw climb to poor modes): sampling begins at the prior.
+        """The encoder's input. It is None without ranges, which the encoder was trained with, and if the pose is known
+        (guesses at one yaw climb to poor modes). Then sampling begins at the prior.
         """
         view, model = self.view, self.prior.model
         if view.pose_known or view.frame.depth is None or not isinstance(model, ProbNeRF):
@@ -78,7 +78,7 @@ class ViewSampler:
         return jax.random.key(self.seed)
 
     def guess(self) -> Posterior:
-        """What the encoder takes the object for, where it may be asked (`asks_encoder`)."""
+        """The encoder's guess. Requires `asks_encoder`."""
         assert isinstance(self.prior.model, ProbNeRF) and self._picture is not None
         key = jax.random.fold_in(self._key, 1)
         with self.stopwatch.part("climbing"):
@@ -95,9 +95,9 @@ class ViewSampler:
     def more_runs(
         self, done: int, wanted: int, on_stage: Callable[[StageInfo], bool | None]
     ) -> tuple[list[Posterior], StopReason | None]:
-        """Runs after the first `done` ones until there are as many as wanted, and what ended them before, if anything.
+        """Runs number `done` to `wanted` - 1, and the reason if they ended early, else None.
 
-        A run that is cut short is left out, but for the very first, which is better than none.
+        An interrupted run is left out, except the very first, which is better than none.
         """
         runs: list[Posterior] = []
         for number in range(done, wanted):
@@ -113,7 +113,7 @@ class ViewSampler:
         return runs, None
 
     def run(self, number: int, on_stage: Callable[[StageInfo], bool | None]) -> Posterior:
-        """One run, of its own random numbers; other threads' wait. `on_stage` is told stages of all runs together."""
+        """One run, with its own random numbers; other threads' runs wait. `on_stage` gets the stages of all runs."""
         self._stage_s = []
         stages = None if self.limits.stages is None else self.limits.stages - self.stages
         since = 0.0

@@ -18,14 +18,14 @@ from probnerf.types import FREE, UNKNOWN, Posterior, StopReason
 
 
 def warm_up(tracker: Tracker) -> None:
-    """Look at an object of the shipped recording with a tracker of the same prior and configuration: as if nothing
-    stood before it, for which inference climbs, and half hidden, as it is there, for which it begins at the prior. It
-    is a rehearsal: programs that are kept (`probnerf.compile_cache`) are read, or compiled, and not run.
+    """Infer an object of the shipped recording with a tracker of the same prior and configuration. Infer it once as if
+    nothing occluded it (inference climbs), and once half hidden, as recorded (inference begins at the prior). It is a
+    rehearsal: cached programs (`probnerf.compile_cache`) are read, others are compiled, and none is run.
 
-    Raises KeyboardInterrupt if Ctrl-C ended it, which the sampler may keep for itself.
+    Raises KeyboardInterrupt if Ctrl-C ended it, even if the sampler caught it.
 
-    A full garbage collection stops every thread. Over what JAX keeps of its programs it takes 0.1 to 0.3 s, several
-    periods of a camera, so what is there by then is set aside from it.
+    A full garbage collection stops every thread. With the objects that JAX keeps for its programs it takes 0.1 to
+    0.3 s, several periods of a camera. So the objects that exist by then are excluded from it.
     """
     frame = next(iter(Log(SHIPPED_LOG)))
     hidden = segment(frame)[0]
@@ -42,15 +42,15 @@ def warm_up(tracker: Tracker) -> None:
 
 
 def _infer_twice(trial: Tracker, look: Look, frame: Frame, hidden: Segment) -> None:
-    """The object alone, again where that was cut short, and half hidden."""
+    """The object alone, the same continued after an interruption, and half hidden."""
     update = trial.infer(look, Limits(stages=1), Callbacks(on_answer=lambda _: None))
     if update.hypotheses.result == StopReason.INTERRUPTED:
         raise KeyboardInterrupt
     again = trial.look(frame, _alone(hidden))
     assert again is not None
-    _sampled(trial, again, trial._tracks[again.object_id].posterior)  # what a next frame asks
+    _sampled(trial, again, trial._tracks[again.object_id].posterior)  # as for a next frame
     anew = trial.look(frame, hidden, lambda _: (0, True))
-    assert anew is not None  # to publish it needs nothing new
+    assert anew is not None  # publishing it needs no new programs
     _sampled(trial, anew, _sampled(trial, anew, None))
 
 

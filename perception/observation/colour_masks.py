@@ -15,9 +15,9 @@ _SQUARE = np.ones((3, 3), bool)
 def label_colour(frame: Frame, config: MaskConfig) -> Int32[np.ndarray, "h w"]:
     """Object ids per pixel, 0 for none: 1 in a drawn box, 1..n by size against a background, or the frame's own.
 
-    With a box, 2.. are the boxes of what may stand before it.
+    With a box, ids from 2 are the boxes of possible occluders.
 
-    Raises `ValueError` or `FileNotFoundError` if there is none of the three, or nothing is found.
+    Raises `ValueError` or `FileNotFoundError` if none of the three is given, or nothing is found.
     """
     if config.box_px is not None:
         label = _in_box(frame.rgb, config.box_px, config).astype(np.int32)
@@ -120,7 +120,7 @@ def _object_in(
 
 
 def _whole(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """A mask without its small holes; what a handle encloses is no hole."""
+    """A mask with its small holes filled; the opening of a handle stays."""
     holes, _ = ndimage.label(ndimage.binary_fill_holes(mask) & ~mask)
     small = np.bincount(holes.ravel()) < 0.01 * mask.sum()
     small[0] = False

@@ -1,4 +1,4 @@
-"""The cube that an object is inferred in: where it stands, how large it is, and how well both are known."""
+"""The cube that an object is inferred in: its place and size, and their uncertainty."""
 
 from dataclasses import dataclass, replace
 
@@ -71,7 +71,7 @@ def object_frame(frame: Frame, segment: Segment, config: ObjectFrameConfig) -> O
 
 
 def _beside_the_unseen(segment: Segment, width: int) -> Bool[np.ndarray, "h w"]:
-    """Pixels within `width` px of something nearer or of the picture's edge: an object there goes on unseen."""
+    """Pixels within `width` px of a nearer object or of the picture's edge, where more of the object may be hidden."""
     beside = ndimage.binary_dilation(np.pad(segment.occluder, width, constant_values=True), iterations=width)
     return beside[width:-width, width:-width]
 

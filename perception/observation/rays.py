@@ -1,4 +1,4 @@
-"""From a segment of a frame to what the model conditions on: rays in the object's cube."""
+"""From a segment of a frame to the model's observation: rays in the object's cube."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ NO_LIMIT = 1e3  # cube units: a ray that misses the object without an end
 
 @dataclass(frozen=True, eq=False)
 class _WindowPixels:
-    """What each of the n pixels in the cube's window says, row by row."""
+    """The data of each of the n pixels in the cube's window, row by row."""
 
     pixels: Int[np.ndarray, "n 2"]  # u, v
     direction: Float[np.ndarray, "n 3"]  # of its ray, along the cube's axes, unit
@@ -37,11 +37,11 @@ def observe(
     seed: int = 0,
     cube: ObjectFrame | None = None,
 ) -> tuple[Observation, ObjectFrame]:
-    """What one frame says about one object, in rays, and the cube that they live in: `cube`, if it is known already.
+    """One frame's observation of one object, as rays, and the rays' cube: `cube`, if it is known already.
 
     Rays: `colour_rays` OBJECT pixels (colour, and range where measured), then `free_rays` FREE pixels, then
     `occluder_rays` UNKNOWN pixels with the range up to which they are empty, less two sigma. Each group is well spread
-    over its pixels and filled up with padding, which says nothing. Deterministic in `seed`.
+    over its pixels and filled with padding, which has no effect. Deterministic in `seed`.
 
     Raises `ValueError` if the object is outside the tabletop's range of sizes.
     """
@@ -117,7 +117,7 @@ def _observation(
     cube: ObjectFrame,
     config: ObserveConfig,
 ) -> Observation:
-    """The chosen pixels as an Observation. Padding looks at the cube's centre and says nothing.
+    """The chosen pixels as an Observation. Padding looks at the cube's centre and has no effect.
 
     A range d has the standard deviation a + b d^2. A FREE ray is empty up to its measured end, an occluder's up to two
     standard deviations before it.
@@ -171,8 +171,8 @@ def calibration_widths(camera: Camera, cube: ObjectFrame) -> Float[np.ndarray, "
     - One picture shows an object of size S at distance d and one of (1 + s) S at (1 + s) d: angles err by s, and the
       ranges would tie the size down to better than that. The offset that they share gets s d.
     The plane is seen by the same rays and errs with the object, so its height gets nothing. Deviations of the
-    distortion are left out, for they are bound up with those of f and c. These are widths of the prior: what the
-    likelihood then says of place and size is said by the stated intrinsics, and narrows all but what the offset frees.
+    distortion are left out: they are correlated with those of f and c. These are widths of the prior. The likelihood
+    uses the stated intrinsics, and narrows all of place and size except along the shared offset.
     """
     if camera.K_std is None:
         return np.zeros(5)

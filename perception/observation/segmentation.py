@@ -1,4 +1,4 @@
-"""Objects in a frame: their masks, the plane each stands on, and what every pixel says about each of them.
+"""Objects in a frame: their masks, the plane each stands on, and the status of every pixel for each of them.
 
 With depth the plane is measured. Without, it is supposed (`PlaneGuess`) and colour finds the objects (`MaskConfig`).
 """
@@ -37,13 +37,13 @@ class Segment:
 def segment(frame: Frame, object_id: int | None = None, config: SegmentConfig | None = None) -> list[Segment]:
     """The objects of a frame, or the one with `object_id`.
 
-    With a label map its ids are the objects. Without one, what stands on the support plane is clustered and numbered
-    from the largest. Statuses per object: OBJECT in its mask; FREE where the ray is known to miss it: the depth there
-    is on or below the support plane, or beyond the object, or absent where the label map says background; UNKNOWN
+    With a label map its ids are the objects. Without one, points above the support plane are clustered and numbered
+    from the largest. Statuses per object: OBJECT in its mask. FREE where the ray is known to miss it: the depth there
+    is on or below the support plane, or beyond the object, or absent where the label map says background. UNKNOWN
     otherwise: nearer things, pixels without depth, the rim of the mask, mask pixels whose depth is the background's.
 
-    Without depth FREE is all that is not in the mask or next to it, save other masks that may be of things before the
-    object: what is in no mask is taken to be behind.
+    Without depth, pixels outside the mask and its rim are FREE, except other masks that may belong to things in front
+    of the object. Pixels in no mask count as behind it.
 
     Raises `ValueError` if there is no plane, no such id, or a mask of a few pixels. Without `object_id` masks that
     are too small are passed over, unless none is left.
@@ -157,8 +157,8 @@ def _standing(
     on_plane: Bool[np.ndarray, "h w"],
     config: SegmentConfig,
 ) -> list[Bool[np.ndarray, "h w"]]:
-    """Masks of the things that stand on the plane, the largest first. Raises `ValueError` if there is none."""
-    # The table is the largest patch of the plane, whose extension may graze a chair or a shelf.
+    """Masks of the objects on the plane, the largest first. Raises `ValueError` if none is found."""
+    # The table is the largest patch of the plane; elsewhere the plane may cut a chair or a shelf.
     patch = _groups(points[on_plane] @ horizontal(plane).T, 0.02)
     table = points[on_plane][patch == np.bincount(patch).argmax()][::7]
     height, z = heights(points, plane), points[..., 2]
@@ -219,8 +219,8 @@ def _unstack(
 ) -> list[Int[np.ndarray, "m"]]:
     """Indices of the parts of one cluster, cut where something stands on a level face (a can on a box).
 
-    A level face is a layer of height that holds far more points than the others do; sides fill all layers alike.
-    What is less than half as wide as all below it is its neck, spout or knob.
+    A level face is a layer of height with far more points than the others; sides fill all layers equally.
+    A part less than half as wide as all below it is a neck, spout or knob, and is not cut off.
     """
 
     flat = cloud @ horizontal(plane).T
@@ -269,7 +269,7 @@ def _own_plane(
     """The plane that an object stands on: the table, or parallel to it the top of the thing below.
 
     An object is taken to stand on another where its lowest points (2nd percentile) are higher than `lifted` and the
-    pixels around them see a surface at their height, within 3 cm. Where its foot is merely hidden, it stands on the
+    pixels around them see a surface at their height, within 3 cm. If only its foot is hidden, it stands on the
     table. (A thing that touches the back of a box of about its hidden height is mistaken for one on top of it.)
     """
     height = heights(points, table)
@@ -293,7 +293,7 @@ def _statuses(
     label: Int[np.ndarray, "h w"] | None,
     config: SegmentConfig,
 ) -> tuple[Int[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """What each pixel says about one object, and which of the UNKNOWN ones see something else."""
+    """The status of each pixel for one object, and which of the UNKNOWN ones see something else."""
     distance, height = np.linalg.norm(points, axis=-1), heights(points, plane) / noise_growth(points)
     measured = np.isfinite(distance)
     body = points[mask & measured & (height > config.base)]

@@ -1,4 +1,4 @@
-"""The plane that things stand on, found in a frame's points."""
+"""The support plane, found in a frame's points."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -20,12 +20,12 @@ def heights(points: Float[np.ndarray, "... 3"], plane: Float[np.ndarray, "4"]) -
 def support_plane(
     points: Float[np.ndarray, "h w 3"], label: Int[np.ndarray, "h w"] | None, config: PlaneConfig
 ) -> tuple[Float[np.ndarray, "4"], Bool[np.ndarray, "h w"]]:
-    """The plane (n, d) that things stand on and its pixels.
+    """The support plane (n, d) and its pixels.
 
     RANSAC over triplets of points up to a quarter of the picture apart, four planes one after the other, each refitted
-    to its inliers by total least squares. The most pixels win, where a plane that leans away from the picture's upward
-    direction (a wall) counts a quarter, and one with nothing standing on it (the floor, a box's top) a tenth. What may
-    stand on it is whatever the label map numbers, or without one any point that is a little higher.
+    to its inliers by total least squares. The plane with most pixels wins. A plane not perpendicular to the picture's
+    upward direction (a wall) counts a quarter, and one with nothing on it (the floor, a box's top) a tenth. Objects on
+    it are the labelled pixels, or without a label map any points a little higher.
     Raises `ValueError` if no plane holds a twentieth of the points.
     """
     rng = np.random.default_rng(config.seed)

@@ -22,10 +22,10 @@ _PX_PER_SQUARE = 40
 class PlateMaskConfig:
     """What separates the object from its surroundings."""
 
-    lowest: float = 0.006  # m above the plate; what is lower is the plate's, as depth errs by millimetres
-    contrast: float = 30.0  # of 255: a pixel that differs so much from the empty plate is the object's
-    blur: float = 1.5  # px: the empty plate's edges may lie about so far off
-    speck: int = 5  # px: what is thinner is noise, and gaps that are thinner are closed
+    lowest: float = 0.006  # m above the plate; lower points are the plate: depth errs by millimetres
+    contrast: float = 30.0  # of 255: a pixel that differs more from the empty plate belongs to the object
+    blur: float = 1.5  # px: error of the empty plate's edges
+    speck: int = 5  # px: thinner regions are noise, and thinner gaps are closed
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ def mask_by_picture(
         to_other = _plate_to_pixels(other, T_other)
         turned = cv2.warpPerspective(other.rgb, to_view @ np.linalg.inv(to_other), box, borderMode=cv2.BORDER_REPLICATE)
         around = cv2.dilate(_on_board(board, to_other, box).astype(np.uint8), np.ones((5, 5), np.uint8))
-        ground = cv2.inpaint(other.rgb, around, 3, cv2.INPAINT_TELEA)  # what the board hid there, where it has left
+        ground = cv2.inpaint(other.rgb, around, 3, cv2.INPAINT_TELEA)  # fill in where the board was and is no longer
         expected = np.where(on_board[..., None], turned, ground).astype(np.float32)
     else:
         printed = board.picture(_PX_PER_SQUARE)
@@ -115,12 +115,12 @@ def mask_by_picture(
         # paper and ink as this light shows them; the object hides less than half of either
         paper, ink = (np.median(view.rgb[on_board & (ideal[..., 0] == value)], axis=0) for value in (1.0, 0.0))
         expected = (ink + ideal * (paper - ink)).astype(np.float32)
-    if empty is None:  # whatever is as bright as paper, or brighter
+    if empty is None:  # pixels at least as bright as paper count as empty
         expected = np.where(on_board[..., None], expected, np.clip(view.rgb, expected, 255.0).astype(np.float32))
     seen, wanted = (cv2.GaussianBlur(np.asarray(a, np.float32), (0, 0), config.blur) for a in (view.rgb, expected))
     differs = np.abs(seen - wanted) > config.contrast
     wide = _largest(differs.any(axis=-1) & view.inside, config)
-    return ndimage.binary_erosion(wide, np.ones((3, 3)))  # by about what the blur added
+    return ndimage.binary_erosion(wide, np.ones((3, 3)))  # by about the width that the blur added
 
 
 def bounds_by_depth(

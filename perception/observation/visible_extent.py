@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
-_LOOKS_DOWN = np.radians(8.0)  # the least angle at which the far side of a top is told from its near side
+_LOOKS_DOWN = np.radians(8.0)  # least angle at which a top's far side can be distinguished from its near side
 
 
 def visible_body(
@@ -31,7 +31,7 @@ def visible_body(
         back, near, _, _ = _extents(x[top], y[top], hidden[top])
         left, right, _, _ = _extents(y[top], x[top], hidden[top])
         centre_x, centre_y = float(np.median(back + near)) / 2, float(np.median(left + right)) / 2
-        # The longest side whatever its direction: most chords of a box, some of a disc, few of a handle are that long.
+        # The longest side in any direction: most chords of a box, some of a disc, few of a handle are that long.
         for angle in np.radians(np.arange(0.0, 180.0, 15.0)):
             along, over = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
             start, end, _, _ = _extents(along[top], over[top], hidden[top])

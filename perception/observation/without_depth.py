@@ -1,4 +1,4 @@
-"""Where an object stands and how large it is, from its mask and a supposed support plane: a view without depth.
+"""Place and size of an object in a view without depth, from its mask and a given support plane.
 
 Symbols: the camera is h over the plane; a point is at horizontal distance rho from the place below the camera, in
 direction phi, at height z; slope = (h - z) / rho is the tangent of its ray's angle below the horizon.
@@ -14,8 +14,8 @@ from perception.observation.settings import PlaneGuess
 from perception.sources.frame import Frame
 from probnerf.types import FREE
 
-# Added to the prior widths of a guess without depth (cube units towards the camera and across, log-scale): for bodies
-# that are round where they stand, and for others, whose depth a silhouette does not tell. By validation objects.
+# Added to the prior's standard deviations without depth (cube units towards the camera and across, log-scale): for
+# bodies with a round foot, and for others, whose depth is not visible in a silhouette. From validation objects.
 _ROUND, _ANGULAR = (0.03, 0.0, 0.0), (0.30, 0.06, 0.12)
 _NOT_ROUND = 0.07  # rms deviation of the foot's outline from an arc, of its radius; cartons: more, others: less
 _STEEPEST = 4.0  # slope of the nearest point of the foot (76 degrees), beyond which a picture shows no height
@@ -36,7 +36,7 @@ class StandingBody:
 
 
 def supposed_plane(frame: Frame, guess: PlaneGuess) -> Float[np.ndarray, "4"]:
-    """The support plane (n, d) in the camera frame (m). Raises `ValueError` if nothing tells it."""
+    """The support plane (n, d) in the camera frame (m). Raises `ValueError` if it is unknown."""
     if guess.camera_height is not None and guess.tilt is not None:
         tilt = np.radians(guess.tilt)
         return np.array([0.0, -np.cos(tilt), -np.sin(tilt), guess.camera_height])
@@ -82,16 +82,17 @@ def standing_body(
     """The body that a mask outlines, if it stands on the plane; `plane_sigma`: of the height (m) and the tilt (rad).
 
     A vertical cylinder of radius R whose axis is at distance D fills the directions |phi| <= alpha, sin alpha = R / D,
-    whatever its height. The lowest pixel sees the near side of its foot, slope_near = h / (D - R); the highest one the
-    far side of its top, slope_far = (h - height) / (D + R), or the near side where the top is above the camera. So
+    independent of its height. The lowest pixel sees the near side of its foot, slope_near = h / (D - R). The highest
+    one sees the far side of its top, slope_far = (h - height) / (D + R), or its near side if the top is above the
+    camera. So
         D = h / slope_near / (1 - sin alpha_foot),   R = D sin alpha,   height = h - slope_far D (1 + sin alpha_top),
     with alpha_foot and alpha_top of the pixels nearer than the axis in the foot's plane and farther in the top's.
 
     A plane that is d_h higher and d_tilt steeper than supposed moves the foot along its ray by the share
-    d_h / h + d_tilt / slope of its distance; and as the outline stays, the body grows by that same share: a picture's
-    scaling about the camera, which no pixel tells. `sight_sigma` is its standard deviation.
+    d_h / h + d_tilt / slope of its distance. As the outline stays the same, the body grows by the same share: a scaling
+    about the camera, which no pixel can detect. `sight_sigma` is its standard deviation.
 
-    Where the foot's outline is no arc, the body is none of revolution: only its width is seen, hardly its depth.
+    If the foot's outline is not an arc, the body is not one of revolution: its width is visible, its depth hardly.
     Raises `ValueError` if the foot is hidden or above the horizon, or seen too steeply or too flatly.
     """
     up, h = plane[:3], float(plane[3])
@@ -159,7 +160,7 @@ def _half_width(phi: Float[np.ndarray, "n"], least: float, most: float) -> float
 
 
 def _deviation(phi: Float[np.ndarray, "n"], rho: Float[np.ndarray, "n"], D: float, foot: float) -> float:
-    """Rms deviation of the foot's near outline from a circle's, of its radius; large where too few pixels tell."""
+    """Rms deviation of the foot's near outline from a circle, relative to its radius; large with too few pixels."""
     at = np.linspace(-0.75, 0.75, 12) * foot
     columns = [np.abs(phi - a) < 0.07 * foot for a in at]
     if not all(c.any() for c in columns):

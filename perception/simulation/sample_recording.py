@@ -1,4 +1,4 @@
-"""The recording that ships with the project, and how to make it.
+"""The recording that ships with the project, and the program that makes it.
 
 `python -m perception.simulation.sample_recording` writes it again.
 

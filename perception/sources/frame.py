@@ -81,8 +81,8 @@ def _plane(name: str, values: Shaped[np.ndarray, "h w"], dtype: type, rgb: UInt8
 class Source(Protocol):
     """Frames in time order, once or more, and notes about what was missing (final when the iteration has ended).
 
-    Of a `live` source the frames come when the camera takes them, and go on until `close`, from whatever thread, ends
-    the iteration under way and lets the device go; then it is over. A source that is not live need not be closed.
+    A `live` source yields frames as the camera takes them. `close`, from any thread, ends the iteration and releases
+    the device; the source cannot be used afterwards. A source that is not live need not be closed.
     """
 
     @property

@@ -24,10 +24,9 @@ def read_frame_folder(path: Path | str) -> Frame:
     """The frame in a folder: color.png, meta.json, and depth.png and label.png where they are.
 
     depth.png has 16 bits, and 0 or 65535 where depth is unknown. meta.json gives `camera_matrix_px` (3x3) and
-    `depth_unit_m` (m per count), and may give `distortion` and `distortion_model` (as `Camera`; none by default), what
-    its calibration knows of their errors (`camera_matrix_std_px`, `distortion_std`, `rms_px`), `stamp_ns` (0),
-    `frame_id` ("camera") and `T_world_camera` (4x4, m); whatever else it holds is not read. With neither depth.png nor
-    depth_unit_m it is a frame without depth.
+    `depth_unit_m` (m per count), and may give `distortion` and `distortion_model` (as `Camera`; none by default),
+    their errors (`camera_matrix_std_px`, `distortion_std`, `rms_px`), `stamp_ns` (0), `frame_id` ("camera") and
+    `T_world_camera` (4x4, m). Other keys are ignored. Without depth.png and depth_unit_m it is a frame without depth.
     Raises `FileNotFoundError` or `ValueError` naming the file and the remedy.
     """
     path = Path(path)
@@ -73,9 +72,9 @@ def read_frame_folder(path: Path | str) -> Frame:
 def write_frame_folder(path: Path | str, frame: Frame) -> None:
     """Write a frame as the folder that `read_frame_folder` reads, over an earlier one.
 
-    All comes back as it was, but depth only to within half a count of 0.1 mm (1 mm where some is beyond 6.5 m), and
-    what is beyond 65.5 m as 65.5 m. meta.json goes first and comes last, so that a folder that was not finished is not
-    read. Raises `ValueError` for ids that a label.png cannot hold.
+    Everything is read back exactly except depth: it is rounded to 0.1 mm (1 mm if some is beyond 6.5 m), and limited to
+    65.5 m. meta.json is removed first and written last, so that an unfinished folder is not read.
+    Raises `ValueError` for ids that a label.png cannot hold.
     """
     path = Path(path)
     if frame.label is not None and not 0 <= frame.label.min() <= frame.label.max() <= 65535:
@@ -122,7 +121,7 @@ def read_png(path: Path) -> Shaped[np.ndarray, "h w *c"]:
         raise FileNotFoundError(f"{path} is missing; a frame folder holds color.png, depth.png and meta.json") from None
     if not data.startswith(_PNG_MAGIC):
         raise ValueError(f"{path} is not a PNG; save it again as PNG")
-    # OpenCV fills what is missing with zeros and only prints a warning, so the chunks are checked first.
+    # OpenCV fills missing data with zeros and only prints a warning, so the chunks are checked first.
     at, kind = len(_PNG_MAGIC), b""
     while kind != b"IEND":
         size = int.from_bytes(data[at : at + 4], "big")

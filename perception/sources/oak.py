@@ -1,8 +1,8 @@
 """OAK cameras through DepthAI v3: colour with depth aligned to it, in pairs of one moment, and the factory calibration.
 
 Stamps are UNIX ns: DepthAI maps the camera's hardware clock to this computer's steady clock (and keeps both in step),
-and the steady clock's distance from UNIX time is taken once per connection, so that a clock that is set meanwhile moves
-no stamp. DepthAI hands stamps over in whole microseconds.
+and the steady clock's offset from UNIX time is measured once per connection, so that setting the clock does not change
+stamps. DepthAI gives stamps in whole microseconds.
 """
 
 import os
@@ -28,10 +28,10 @@ import depthai as dai
 
 _COLOUR, _LEFT, _RIGHT = dai.CameraBoardSocket.CAM_A, dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C
 _STEREO_SIZE = (640, 400)  # px, of both eyes; depth is resampled to the colour image
-_SYNC_ATTEMPTS = 10  # pairs that Sync looks for before it hands out images that are too far apart
+_SYNC_ATTEMPTS = 10  # pairs that Sync tries before it returns images that are too far apart
 _QUEUE = 30  # pairs that wait here before the oldest is dropped
 _POLL = timedelta(milliseconds=100)
-_OPENING_S, _CLOSING_S = 30.0, 3.0  # a device that hangs is given up after these
+_OPENING_S, _CLOSING_S = 30.0, 3.0  # timeouts for a device that hangs
 _METRES = np.float32(1e-3)  # depth counts are millimetres
 
 
@@ -119,7 +119,7 @@ class OakSource:
             except OSError as error:
                 if not self._received:  # it never worked: the user must act
                     raise
-                if self._received > before:  # else it is still away
+                if self._received > before:  # else it is still disconnected
                     self._lost += 1
                     self._away, self._why, wait = True, str(error), self._config.retry_s
             self._closed.wait(wait)
@@ -191,9 +191,9 @@ class OakSource:
             raise ValueError(f"{self._images.name}: {error}") from None
 
     def _agreed(self, camera: Camera, colour: dai.ImgFrame) -> Camera:
-        """The calibration, with the camera matrix that the image says it has, where that differs.
+        """The calibration, with the image's own camera matrix if that differs.
 
-        It does where the device cropped its sensor before it scaled: the factory calibration knows of no such crop.
+        It differs if the device crops its sensor before scaling: the factory calibration does not include the crop.
         """
         transformation = colour.getTransformation()
         K = np.array(transformation.getIntrinsicMatrix())
@@ -279,8 +279,8 @@ class DeviceImages:
 def open_oak(device_id: str = "", camera: Camera | None = None, config: OakConfig | None = None) -> OakSource:
     """The OAK camera `device_id` (its id, USB path or address; empty: the first that is found).
 
-    `camera`, of the images as they are streamed, takes the place of the factory calibration; they are then asked for in
-    its size. Raises `OSError`, one line, where there is none, in about half a second.
+    `camera`, for the images as streamed, replaces the factory calibration; the images are then requested in its size.
+    Raises `OSError`, one line, after about half a second if no device is found.
     """
     config = config or OakConfig()
     if camera is not None:
@@ -343,5 +343,5 @@ def _close(opened: Opened) -> None:
 
     try:
         within(_CLOSING_S, close, "")
-    except (OSError, RuntimeError):  # a device that is gone need not answer
+    except (OSError, RuntimeError):  # a disconnected device need not answer
         pass

@@ -18,8 +18,8 @@ class Playback:
     """The frames of a log from `start_s` to `end_s` (None: its end), seconds after its first frame, as a Source.
 
     With `pace` 1 frames come at the intervals of their stamps, with 2 twice as fast, with 0 as fast as they are read. A
-    frame that is asked for too late comes at once: whoever wants only the newest one must drop the others. Raises
-    ValueError for a range or a pace that is none, and in iteration, with the log's true range, where it has no frame.
+    frame requested late comes at once: a consumer of the newest frame must drop the others. Raises ValueError for an
+    invalid range or pace, and in iteration, with the log's actual range, if the range has no frame.
     """
 
     def __init__(self, log: Log, pace: float = 1.0, start_s: float = 0.0, end_s: float | None = None) -> None:
@@ -72,7 +72,7 @@ def open_playback(
 ) -> Source:
     """The source at `path`, with `camera` and `topics` in place of its own (see `open_source`); a log as `Playback`.
 
-    Raises ValueError if a range is asked of a source that is no log, and whatever `open_source` raises.
+    Raises ValueError if a range is given for a source that is not a log, and what `open_source` raises.
     """
     source = open_source(path, camera, topics)
     if isinstance(source, Log):
@@ -92,7 +92,7 @@ def frame_at(
 ) -> tuple[Frame, list[str]]:
     """Frame `index` (-1: the last) of a source, or of a recording's range, and the source's notes until there.
 
-    Raises ValueError if there is none, and what `open_playback` raises.
+    Raises ValueError if there is no such frame, and what `open_playback` raises.
     """
     opened = open_playback(source, start_s=start_s, end_s=end_s, camera=camera, topics=topics)
     frame, count = None, 0

@@ -85,9 +85,9 @@ class Reader:
         return listener
 
     def newest(self, timeout: float | None = None) -> Frame | None:
-        """The newest frame that was not handed out before, waited for at most `timeout` seconds (None: until the end).
+        """The newest frame not returned before, waited for at most `timeout` seconds (None: until the end).
 
-        None where none came, or none will come. Raises what the source raised.
+        None if none came or none will come. Raises what the source raised.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._newest is not None or self.over, timeout)

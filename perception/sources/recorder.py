@@ -49,10 +49,10 @@ class _Raw:
 class Recorder:
     """Writes a new MCAP file (profile ros2) until `close`, which `with` calls.
 
-    `frames` and `bytes` tell what was written and `dropped` how many frames were not, because the writer was behind
-    (never with `wait`, which lets `write_frame` wait instead). When writing fails, on a full disk say, `error` becomes
-    one line, `on_error` is called with it (by the writer's thread), and whatever is handed over later is ignored; what
-    was written before can be read. Raises OSError in one line if the file is there already or cannot be made.
+    `frames` and `bytes` count what was written, and `dropped` the frames lost because the writer was behind (none with
+    `wait`, which makes `write_frame` wait instead). If writing fails, for example on a full disk, `error` is one line,
+    `on_error` is called with it (by the writer's thread), and later data are ignored. Data written before can be read.
+    Raises OSError in one line if the file exists already or cannot be created.
     """
 
     def __init__(
@@ -98,9 +98,10 @@ class Recorder:
         self.close()
 
     def write_frame(self, frame: Frame) -> bool:
-        """Hand over a frame, whose arrays must not change afterwards; False where it was dropped.
+        """Queue a frame for writing. Its arrays must not change afterwards. Returns False if it was dropped.
 
-        Camera deviations have no place in ROS messages. Raises ValueError if a label does not fit 16 bits.
+        Standard deviations of the camera are not written: ROS messages have no field for them.
+        Raises ValueError if a label does not fit 16 bits.
         """
         if frame.label is not None:
             low, high = int(frame.label.min()), int(frame.label.max())
@@ -109,7 +110,7 @@ class Recorder:
         return self._hand_over(frame, self._wait)
 
     def write_raw(self, topic: str, type_name: str, msgdef_text: str, cdr_bytes: bytes, stamp_ns: int) -> None:
-        """Hand over a message of any type ("package/msg/Name"), serialised as CDR; waits while the writer is behind.
+        """Queue a message of any type ("package/msg/Name"), serialised as CDR. Waits while the writer is behind.
 
         `msgdef_text` is its definition with those it depends on, as MCAP's encoding "ros2msg" wants it. Raises
         ValueError where the topic holds another type.
@@ -259,7 +260,7 @@ def _depth(depth: Float32[np.ndarray, "h w"], config: RecordConfig) -> tuple[Sha
     """The samples and their encoding."""
     known = np.where(np.isnan(depth), np.float32(0.0), depth)
     counts = np.minimum(known * np.float32(1000.0) + np.float32(0.5), np.float32(SATURATED)).astype(np.uint16)
-    counts = known_counts(counts)  # what is beyond 65.5 m counts as unknown, where it is not kept as it is
+    counts = known_counts(counts)  # in counts, depth beyond 65.5 m is unknown
     if config.depth == "exact":
         return (counts, "16UC1") if np.array_equal(counts * MM, known) else (depth, "32FC1")
     return counts, "16UC1"

@@ -58,10 +58,10 @@ class Log:
     """The frames of a recording: `.mcap`, `.db3`, a ROS 2 bag folder or a ROS 1 `.bag`.
 
     Topics are chosen as `topics` says, or given as `names`: colour, depth of the same size and camera, the camera_info
-    of that camera, and labels. Each colour image takes the depth (and label) nearest in stamp within `tolerance_ns`,
-    and the latest camera_info before it, else the first; or `camera`, where it is given, and then no camera_info is
-    needed. A log without depth gives frames whose depth is None; an MCAP that is cut short gives the frames that are
-    there. T_world_camera is what `Recorder` kept, else None. `notes` says what was missing. Raises `FileNotFoundError`
+    of that camera, and labels. Each colour image gets the depth (and label) nearest in stamp within `tolerance_ns`,
+    and the latest camera_info before it, else the first. With `camera` no camera_info is needed. A log without depth
+    gives frames whose depth is None. A truncated MCAP gives the frames that it holds. T_world_camera is the one that
+    `Recorder` wrote, else None. `notes` lists what was missing. Raises `FileNotFoundError`
     or `ValueError`, one line with the file and the remedy.
     """
 
@@ -130,7 +130,7 @@ class Log:
     def frames(self, start_s: float = 0.0, end_s: float = np.inf) -> Iterator[Frame]:
         """The frames whose stamp lies from `start_s` to `end_s`, both included, after the first colour image's (s).
 
-        Raises `ValueError`, with the log's true range, if there is none.
+        Raises `ValueError`, with the log's actual range, if it has no such frame.
         """
         self._pairing_notes = []
         frames, unlabelled, first_ns, at = 0, 0, None, 0.0

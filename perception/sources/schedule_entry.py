@@ -33,7 +33,7 @@ class Scheduled:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """The inverse. Raises ValueError for a newer version and for whatever is no entry."""
+        """The inverse. Raises ValueError for a newer version and for text that is not an entry."""
         try:
             values = json.loads(text)
             version = values.pop("version")

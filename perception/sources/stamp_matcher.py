@@ -24,7 +24,7 @@ class Match(Generic[Lead, Partner]):
 
     lead: Lead
     partners: dict[str, Partner | None]  # None: there was none within the tolerance
-    gaps_ns: dict[str, float]  # to the nearest; inf where there was none at all
+    gaps_ns: dict[str, float]  # to the nearest; inf if there was none
 
 
 class StampMatcher(Generic[Lead, Partner]):
@@ -32,7 +32,7 @@ class StampMatcher(Generic[Lead, Partner]):
 
     Stamps rise within a stream, so a partner no older than the leading item ends its search; without one it waits for
     `waiting` more leading items at most. Of each partner stream `kept` items may wait (None: any number). A partner may
-    serve two leading items; `unused` counts by stream those that served none and are gone.
+    match two leading items. `unused` counts, by stream, dropped partners that matched none.
     """
 
     def __init__(self, streams: Sequence[str], tolerance_ns: int, waiting: int = 30, kept: int | None = None) -> None:
@@ -45,12 +45,12 @@ class StampMatcher(Generic[Lead, Partner]):
         self._partners: dict[str, deque[_Waiting[Partner]]] = {stream: deque() for stream in streams}
 
     def push_lead(self, stamp_ns: int, item: Lead) -> list[Match[Lead, Partner]]:
-        """Add an item of the leading stream; returns what is settled by it."""
+        """Add an item of the leading stream. Returns the matches that it settles."""
         self._leads.append((stamp_ns, item))
         return self._settled()
 
     def push_partner(self, stream: str, stamp_ns: int, item: Partner) -> list[Match[Lead, Partner]]:
-        """Add an item of a partner stream; returns what is settled by it."""
+        """Add an item of a partner stream. Returns the matches that it settles."""
         queue = self._partners[stream]
         queue.append(_Waiting(stamp_ns, item))
         settled = self._settled()

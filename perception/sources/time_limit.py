@@ -13,10 +13,10 @@ def within(
     """The result of `call`, or its exception. `OSError` with the complaint if it takes longer; the call is then
     abandoned.
 
-    A result after that goes to `late`, to be closed.
+    A later result is passed to `late`, which closes it.
     """
     finished: Queue[Result | Exception] = Queue()
-    settled = threading.Lock()  # whoever takes it first: the waiting caller's patience, or the result
+    settled = threading.Lock()  # taken by the first of the two: the caller's timeout or the result
 
     def work() -> None:
         try:

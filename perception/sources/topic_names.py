@@ -1,4 +1,4 @@
-"""Names of topics: which are chosen, and what the words of a name say about its images. Standard library only."""
+"""Names of topics: which ones are chosen, and which images a name indicates. Standard library only."""
 
 import re
 from dataclasses import dataclass
@@ -30,4 +30,4 @@ class TopicNames:
     """Topics of a recording that the user names; None: found automatically."""
 
     colour: str | None = None
-    depth: str | None = None  # counts as aligned to colour, whatever its frame_id
+    depth: str | None = None  # counts as aligned to colour, with any frame_id

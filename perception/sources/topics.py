@@ -1,8 +1,8 @@
 """Which topics of a recording are its colour, depth, label and camera_info.
 
 They are chosen by message type, by whole parts of their names (`/cam/image_rect_color` has the parts cam, image, rect
-and color), by the frame_id of their first message and by what the first depth image holds. What is not chosen although
-it might be meant is named in a note.
+and color), by the frame_id of their first message and by the content of the first depth image. Notes name topics that
+are not chosen although they might be meant.
 """
 
 from collections.abc import Mapping
@@ -69,7 +69,7 @@ def doubt(depth: Float32[np.ndarray, "h w"]) -> str | None:
 def colour_topic(path: Path, firsts: Mapping[str, Any], name: str | None = None) -> tuple[str, list[str]]:
     """The colour among topics, each with its first image, and notes. Raises ValueError if there is none.
 
-    `name` is the topic that was asked for.
+    `name` is the requested topic.
     """
     found = [t for t, m in firsts.items() if encoding_of(m) in COLOURS and (t == name or _is_picture(t))]
     if not found or (name is not None and name not in found):
