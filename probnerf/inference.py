@@ -43,14 +43,15 @@ def likelihood_settings(config: InferConfig, sample_pose: bool = True) -> Likeli
 
 
 def likelihood_of(config: InferConfig, observation: Observation, sample_pose: bool = True) -> Likelihood:
-    """The likelihood's settings for one view, with its sizes where there is no kernel (`with_sizes`)."""
+    """The likelihood's settings for one view, with its sizes if there is no kernel (`with_sizes`)."""
     likelihood = likelihood_settings(config, sample_pose)
     return likelihood if library.available() else with_sizes(likelihood, observation)
 
 
 def with_sizes(likelihood: Likelihood, observation: Observation) -> Likelihood:
-    """The settings with one view's number of crossings, which plain JAX packs: padded, so that most views share one
-    compiled program.
+    """The settings with one view's number of crossings, for packing in plain JAX.
+
+    The numbers are padded, so that most views share one compiled program.
     """
     lattice = likelihood.lattice
     each = np.sum(np.asarray(faces_of_view(observation, likelihood)) < foam.FAR, axis=1)
@@ -64,18 +65,18 @@ def with_sizes(likelihood: Likelihood, observation: Observation) -> Likelihood:
 
 
 def crossings_of(likelihood: Likelihood, observation: Observation) -> int:
-    """Crossings of a view at which the field is evaluated for each particle."""
+    """Number of crossings of a view, at which the field is evaluated for each particle."""
     return int(np.sum(np.asarray(faces_of_view(observation, likelihood)) < foam.FAR))
 
 
 def without_sizes(likelihood: Likelihood) -> Likelihood:
-    """The settings less the padded sizes of one view, so that what is asked of shapes compiles once for all views."""
+    """The settings without the padded sizes of one view. So evaluations of shapes compile once for all views."""
     lattice = likelihood.lattice
     return replace(likelihood, lattice=replace(lattice, max_crossings=3 * lattice.planes), packed=(0, 0))
 
 
 def asks_encoder(config: InferConfig, model: Model, picture: EncoderPicture | None) -> bool:
-    """Whether the encoder is used: there is one, it sees enough of the object, and its guess is needed."""
+    """Whether to use the encoder: there is one, it sees enough of the object, and its guess is needed."""
     # delta has too many dimensions for second derivatives
     if picture is None or not config.encoder_starts or config.sample_delta or not isinstance(model, ProbNeRF):
         return False
@@ -85,10 +86,11 @@ def asks_encoder(config: InferConfig, model: Model, picture: EncoderPicture | No
 def modes_of(
     key: Array, model: Model, observation: Observation, config: InferConfig, picture: EncoderPicture | None
 ) -> GaussianMixture | None:
-    """Where tempering begins: the modes that the encoder's guesses climb to (`sampling.modes`), the pose unknown.
+    """The reference for tempering: modes that ascents from the encoder's guesses reach (`sampling.modes`).
 
-    None, the prior, where there is no encoder to ask or too little for it to see. Behind something that hides half of
-    the object its guesses are poor, and modes about them miss what populations from the prior find.
+    The pose is unknown. The result is None (the prior) if there is no encoder or if it sees too little. If half of the
+    object is hidden, its guesses are poor. The modes found from them then miss shapes that populations from the prior
+    find.
     """
     if not asks_encoder(config, model, picture):
         return None
@@ -102,12 +104,12 @@ def modes_of(
 def sampler_of(
     config: InferConfig, reference: GaussianMixture | None, before: Posterior | None = None
 ) -> TemperedSMCConfig:
-    """The populations for where tempering begins; what goes on from `before` keeps to those that made it."""
+    """The SMC settings for a given reference. A run that continues `before` keeps the settings that produced it."""
     if before is None:
         return config.smc_from_prior if reference is None else config.smc
     made = len(before.diagnostics.beta)
     both = [smc for smc in (config.smc, config.smc_from_prior) if made % smc.populations == 0]
-    each = len(before.positions) / made  # several runs of the one may be as many populations as one of the other
+    each = len(before.positions) / made  # both settings may divide the number of populations
     return min(both, key=lambda smc: abs(each - smc.moves * smc.particles), default=config.smc_from_prior)
 
 
@@ -126,9 +128,10 @@ def infer(
 ) -> tuple[Posterior, Likelihood]:
     """Sample p(z~, pose, delta | observation).
 
-    `reference` is where tempering begins (`modes_of`; None: the prior); `before`, instead, a posterior of the same
-    latents that was cut short, to go on from. `deadline` is on time.monotonic()'s clock; `stages` caps the sampler's
-    stages (iterations of annealed HMC, whose schedule is shortened to fit). The start is always made.
+    `reference` is the density at which tempering starts (`modes_of`; None: the prior). `before` replaces it: an
+    unfinished posterior of the same latents, from which to continue. `deadline` is on time.monotonic()'s clock.
+    `stages` limits the sampler's stages. For annealed HMC it limits the iterations, and the schedule is shortened to
+    fit. The start is always made.
     """
     config = config or InferConfig()
     likelihood = likelihood_of(config, observation, sample_pose)
@@ -157,11 +160,11 @@ def encoder_guess(
     yaws: int = 24,
     draws: int = 4,
 ) -> Posterior:
-    """What the encoder alone takes the object for, in a twentieth of a second: z_kj ~ q(z | picture, yaw_k) on a grid.
+    """The encoder's estimate without sampling, in about 0.05 s: z_kj ~ q(z | picture, yaw_k) on a grid of yaws.
 
-    The weight of yaw k is its mean likelihood, W_k = sum_j p(observation | z_kj, yaw_k) / J, shared evenly by its J
-    draws: within a yaw the encoder is taken at its word. x, y and scale are perception's guess. Where the pose is
-    known there is one yaw, of which all are drawn.
+    The weight of yaw k is its mean likelihood, W_k = sum_j p(observation | z_kj, yaw_k) / J. Its J draws share it
+    equally: within a yaw, the encoder's density is used without correction. x, y and scale are perception's guess. If
+    the pose is known, all draws are at that one yaw.
     """
     if likelihood.sample_pose:
         positions = encoder_positions(key, model, picture, even_yaws(yaws), draws, 1.0)

@@ -1,4 +1,4 @@
-"""Properties of sampled positions: their shapes as voxels, their poses, and the share of explained pixels."""
+"""Properties of sampled positions: shapes as voxels, poses, and the share of explained pixels."""
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +13,8 @@ from probnerf.likelihood.settings import Likelihood
 from probnerf.rendering import foam
 from probnerf.types import BASE_Z, OBJECT, POSE_SIZE, UNKNOWN, Observation, Pose
 
-_NOWHERE = 50.0  # cube units, outside every window: the kernel passes such points over
-WALL_ERROR = 0.02  # cube units; how well the prior's shapes place a wall
+_NOWHERE = 50.0  # cube units; outside every window, so the kernel skips such points
+WALL_ERROR = 0.02  # cube units; error of a wall's position in the prior's shapes
 
 
 @program()
@@ -25,16 +25,17 @@ def opacity_grids(
     pose_sigma: Float[Array, "5"],
     wanted: Bool[Array, "g g g"],
 ) -> UInt8[Array, "s g g g"]:
-    """round(255 x opacity across a voxel) of each position's shape on [-1, 1]^3 of the view frame, 0 if not `wanted`.
+    """round(255 x opacity across a voxel) of each position's shape on [-1, 1]^3 of the view frame; 0 if not `wanted`.
 
-    A voxel's opacity is the largest at its eight corners: like the truth's, it is a wall where it meets the solid.
+    A voxel's opacity is the maximum over its eight corners. So it is a wall if it intersects the solid, as in the
+    ground truth.
     """
     grid = wanted.shape[0]
     axis = jnp.linspace(-1.0, 1.0, grid + 1)
     points = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
     corners = jax.lax.reduce_window(jnp.pad(wanted, 1), False, jnp.logical_or, (2, 2, 2), (1, 1, 1), "valid")
     points = jnp.where(corners[..., None], points, _NOWHERE).reshape(-1, 3)
-    decoded = jax.vmap(model.decode)(positions[:, : model.latent])  # together, as in `plain_log_likelihood`
+    decoded = jax.vmap(model.decode)(positions[:, : model.latent])  # as one batch, as in `plain_log_likelihood`
 
     def one(item: tuple[Float[Array, "d"], Float[Array, "w"]]) -> UInt8[Array, "g g g"]:
         position, decoded = item
@@ -51,7 +52,7 @@ def opacity_grids(
 
 @program()
 def poses(model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], pose_sigma: Float[Array, "5"]) -> Pose:
-    """Pose of each position (identity where the pose was known)."""
+    """Pose of each position (the identity if the pose was known)."""
     if not likelihood.sample_pose:
         zeros = jnp.zeros(positions.shape[0])
         return Pose(*[zeros] * 5)
@@ -68,8 +69,8 @@ def scaled_about(
 ) -> Float[Array, "s d"]:
     """Positions whose shapes are scaled about a point: p -> origin + exp(log_factor) (p - origin), view frame.
 
-    Scaled about the camera a shape keeps its picture: what ray it is met on, in which order. Only ranges tell. The
-    positions' poses must be sampled.
+    If `origin` is the camera, the picture of the shape does not change: only its ranges do. The positions must include
+    sampled poses.
     """
     at = model.latent + 2  # of x, y, log-scale, range offset, z
     pose = pose_of(positions[:, model.latent : model.latent + POSE_SIZE], pose_sigma)
@@ -83,15 +84,16 @@ def scaled_about(
 def explained(
     model: Model, likelihood: Likelihood, observation: Observation, positions: Float[Array, "s d"]
 ) -> Float[Array, "s"]:
-    """Share of telling pixels that each position explains: object pixels hit at the measured range, free ones missed.
+    """Share of informative pixels that each position explains.
 
-    A range is explained within 3 standard deviations of the sensor's error and of a well-placed wall's (`WALL_ERROR`):
-    what the likelihood forgives (`wall_sigma`) is more than what a shape of the prior needs.
+    An object pixel is explained if its ray hits at the measured range, a free pixel if its ray misses. The tolerance of
+    a range is 3 standard deviations of the sensor's error combined with `WALL_ERROR`. The likelihood's `wall_sigma` is
+    not used: it is larger than the shapes of the prior need.
     """
     t = faces_of_view(observation, likelihood)
     status = observation.status
     tells = (status != UNKNOWN) | (observation.limit > 0)
-    # padding is put where the window is 0, which costs nothing
+    # padding is outside the window, where it costs nothing
     points = jnp.where((t < foam.FAR)[..., None], foam.points_on_rays(observation.rays, t), foam.FAR)
     decoded = jax.vmap(model.decode)(positions[:, : model.latent])
 

@@ -1,4 +1,4 @@
-"""log p(observation | position) for a batch of positions, by the kernel where it was built, else in plain JAX."""
+"""log p(observation | position) for a batch of positions: by the kernel if it was built, else in plain JAX."""
 
 from collections.abc import Callable
 from functools import partial
@@ -23,7 +23,7 @@ from probnerf.types import Observation, Pose
 def density_at(
     field: Field, weights: Float[Array, "w"], pose: Pose | None, points: Float[Array, "... 3"]
 ) -> Float[Array, "..."]:
-    """Window x density at points of the view frame; by the kernel, which has no gradient, where it was built."""
+    """Window x density at points of the view frame. If the kernel was built, it is used, and there is no gradient."""
     if isinstance(field, MLPField) and library.available():
         row = _row(pose, jnp.zeros(()))
         return kernel_call.density(field, weights[None], row[None], points.reshape(-1, 3)).reshape(points.shape[:-1])
@@ -40,7 +40,7 @@ def weighted_terms(
     t: Float[Array, "n m"],
     pixel_weight: Float[Array, "n"],
 ) -> Float[Array, ""]:
-    """Sum of `pixel_weight` x `pixel_terms`, differentiable in `weights` alone; by the kernel where it was built."""
+    """Sum of `pixel_weight` x `pixel_terms`, differentiable in `weights` only. Uses the kernel if built."""
     if isinstance(field, MLPField) and library.available():
         row = _row(pose, jnp.zeros(()))
         return kernel_call.view_terms(field, likelihood, observation, t, weights[None], row[None], pixel_weight)[0]
@@ -51,10 +51,10 @@ def weighted_terms(
 def map_with_gradient(
     function: Callable, batch_size: int | None, shared: Any, each: Any, x: PyTree[Array]
 ) -> Float[Array, "p"]:
-    """[function(shared, each_p, x_p) for p], differentiable in `x` alone.
+    """[function(shared, each_p, x_p) for p], differentiable in `x` only.
 
-    Value and gradient of an element are computed together, `batch_size` elements at a time (None: one by one), so that
-    memory does not grow with the batch and a CPU's caches hold one element's rays.
+    Value and gradient of an element are computed together, `batch_size` elements at a time (None: one by one). So
+    memory does not grow with the batch, and the rays of one element fit in a CPU's caches.
     """
     return jax.lax.map(lambda item: function(shared, *item), (each, x), batch_size=batch_size)
 
@@ -79,9 +79,9 @@ def log_likelihood(
 ) -> Float[Array, "p"]:
     """Batched log-likelihood for the samplers; differentiable in `positions` only.
 
-    The kernel evaluates an `MLPField` where it was built, particles shared out over threads. Without it they are shared
-    out over JAX's devices where their number allows: one CPU core moves one particle at a time, so a CPU counts as
-    several devices (`JAX_NUM_CPU_DEVICES`).
+    If the kernel was built, it evaluates an `MLPField`, with the particles distributed over threads. Otherwise they are
+    distributed over JAX's devices if their number is divisible. JAX evaluates one particle at a time per device, so a
+    CPU should count as several devices (`JAX_NUM_CPU_DEVICES`).
     """
     if isinstance(args[0].field, MLPField) and library.available():
         return _fused(args, positions)
@@ -100,7 +100,7 @@ def _fused(args, positions):
 
 
 def _row(pose: Pose | None, offset: Float[Array, ""]) -> Float[Array, "6"]:
-    """A pose and the ranges' offset as the kernel takes them."""
+    """A pose and the range offset in the kernel's format."""
     place = jnp.zeros(5) if pose is None else jnp.stack([pose.yaw, pose.x, pose.y, pose.log_scale, pose.z])
     return jnp.append(place, offset)
 
@@ -108,10 +108,10 @@ def _row(pose: Pose | None, offset: Float[Array, ""]) -> Float[Array, "6"]:
 def plain_log_likelihood(
     args: tuple[Model, Likelihood, Observation, Float[Array, "n m"]], positions: Float[Array, "p d"]
 ) -> Float[Array, "p"]:
-    """`log_likelihood` in JAX alone: the kernel's reference, and what runs where there is no kernel."""
+    """`log_likelihood` in JAX only: the kernel's reference, and its replacement if there is no kernel."""
 
     def mapped(args, positions):
-        # together: one by one, each would read the hypernetwork's weights through memory
+        # decode as one batch: one by one, each particle would read all of the hypernetwork's weights from memory
         decoded = jax.vmap(args[0].decode)(positions[:, : args[0].latent])
         return map_with_gradient(_one_particle, None, args, None, (positions, decoded))
 

@@ -1,7 +1,7 @@
 """An `MLPField`'s pixel likelihood with its gradient, and its density, as fused CPU operations (`probnerf/kernel`).
 
-The same functions as `pixel_terms.pixel_terms` summed over pixels and `dispatch.density_at`, without anything of size
-points x width stored.
+They compute the sum of `pixel_terms.pixel_terms` over pixels, and `dispatch.density_at`. They store no array of size
+points x width.
 """
 
 import os
@@ -31,8 +31,8 @@ def view_terms(
 ) -> Float[Array, "p"]:
     """Sum of w_i log p(pixel i | weights_p, pose_p) for each particle, differentiable in `weights` and `pose`.
 
-    `pose` is yaw, x, y, log-scale, z and the ranges' common offset; w is `pixel_weight`, or 1. The likelihood's `power`
-    is not applied. Without differentiation it is a forward pass alone.
+    `pose` is yaw, x, y, log-scale, z and the common offset of all ranges. w is `pixel_weight`, or 1. The likelihood's
+    `power` is not applied. Without differentiation, only the forward pass runs.
     """
     return call(field, likelihood, observation, t, weights, pose, pixel_weight, gradients=False)[0]
 
@@ -49,10 +49,10 @@ def call(
     isa: str = "",
     gradients: bool = True,
 ) -> tuple[Float[Array, "p"], Float[Array, "p w"], Float[Array, "p 6"]]:
-    """(values, gradients by weights, gradients by pose); `isa` is avx512, avx2 or plain ("": the machine's best).
+    """(values, gradients by weights, gradients by pose). `isa` is avx512, avx2 or plain ("": the best available).
 
-    Without `gradients` theirs are empty, [0, w] and [0, 6]. The number of threads changes rounding where there are
-    fewer particles, which they then share; else nothing.
+    Without `gradients`, the gradient arrays are empty, [0, w] and [0, 6]. If there are fewer particles than threads,
+    several threads share a particle, and their number changes the rounding. Otherwise the number has no effect.
     """
     p, w = weights.shape
     shapes = [(p,), (gradients * p, w), (gradients * p, 6)]
@@ -99,7 +99,7 @@ def density(
 ) -> Float[Array, "p n"]:
     """Window x density of each particle at points of the view frame; not differentiable. See `call` for `pose`, `isa`.
 
-    What is outside the window costs nothing. The answer does not depend on the number of threads.
+    Points outside the window cost nothing. The result does not depend on the number of threads.
     """
     found = jax.ShapeDtypeStruct((weights.shape[0], points.shape[0]), jnp.float32)
     inputs = (a.astype(jnp.float32) for a in (weights, pose, points))

@@ -1,4 +1,4 @@
-"""Each pixel's log density in plain JAX: where its ray ends, is it the object, how far, which colour."""
+"""Each pixel's log density in plain JAX: object mask, range and colour."""
 
 from collections.abc import Callable
 from functools import partial
@@ -17,11 +17,12 @@ from probnerf.types import FREE, OBJECT, Observation, Pose
 
 @program(rehearse=False)
 def faces_of_view(observation: Observation, likelihood: Likelihood) -> Float[Array, "n m"]:
-    """Crossings of every ray that its pixel can tell of: constants of the observation, computed once per view.
+    """Crossings of every ray that can affect its pixel. They are constants of the observation, computed once per view.
 
-    None is farther than a FREE or UNKNOWN ray's limit, or than `reach` behind an OBJECT ray's measured range. The first
-    changes nothing. The second takes a surface there, which only an outlier in depth explains, for a missed mask: as
-    likely where the two shares are equal, but for the colour.
+    For FREE and UNKNOWN rays, crossings beyond the limit are dropped. This is exact. For OBJECT rays, crossings more
+    than `reach` behind the measured range are dropped. This is an approximation: a surface there could explain the
+    range only as a depth outlier, and now counts as a mask error instead. Apart from colour, both have the same
+    likelihood if the outlier and mask error rates are equal.
     """
     t = foam.crossings(observation.rays, likelihood.lattice)
     behind = jnp.where(observation.range_valid, observation.range + likelihood.reach, jnp.inf)
@@ -32,9 +33,9 @@ def faces_of_view(observation: Observation, likelihood: Likelihood) -> Float[Arr
 def _where_crossed(
     t: Float[Array, "n m"], most: int, function: Callable[..., Array], *each: Shaped[Array, "n m ..."]
 ) -> Shaped[Array, "n m ..."]:
-    """function(*each) at the crossings that are no padding, at `most` so many; 0 elsewhere (most 0: at every slot).
+    """function(*each) at the crossings that are not padding, at most `most` of them; 0 elsewhere (most 0: every slot).
 
-    Rays differ in their number of crossings, so that most slots are padding, and the field is what costs.
+    Rays differ in their number of crossings, so most slots are padding. Evaluating the field is the main cost.
     """
     if not most:
         return function(*each)
@@ -67,7 +68,7 @@ def pixel_terms(
     t: Float[Array, "n m"],
     range_offset: Float[Array, ""] | float = 0.0,
 ) -> Float[Array, "n"]:
-    """Each pixel's log density: where its ray ends, is it the object, how far, which colour."""
+    """Each pixel's log density: object mask, range and colour."""
     n_colour = observation.colour_count
     points = foam.points_on_rays(observation.rays, t)
     scale = jnp.ones(())
@@ -80,7 +81,7 @@ def pixel_terms(
 
     # OBJECT: sum_i w_i p(m|hit) p(d|t_i) + T p(m|miss) p(d|miss)
     t_hit, log_w = t[:n_colour], faces.log_weight[:n_colour]
-    # the surface lies in the gap before the face: centred on t_i instead, shapes grow by half a gap
+    # the surface lies in the gap before the face: centred on t_i, it would make shapes half a gap too large
     gap = foam.gap_before(t_hit)
     deviation = jnp.sqrt(observation.range_sigma[:n_colour, None] ** 2 + likelihood.wall_sigma**2 + gap**2 / 12.0)
     surface = jnp.where(t_hit < foam.FAR, t_hit - 0.5 * gap, 0.0)
@@ -96,7 +97,7 @@ def pixel_terms(
     log_not = log_miss[:n_colour] + jnp.log(eps) + jnp.where(valid, log_uniform, 0.0)
     as_object = jnp.logaddexp(log_hit, log_not)
 
-    # colour given a hit: N(c; sum w_i c_i / O, s^2)
+    # colour, given a hit: N(c; sum w_i c_i / O, s^2)
     directions = jnp.broadcast_to(observation.rays.direction[:n_colour, None, :], points[:n_colour].shape)
     if pose is not None:
         directions = pose.to_object_direction(directions)
@@ -125,5 +126,5 @@ def pixel_terms(
 
 
 def mean_colour(premultiplied: Float[Array, "n 3"], opacity: Float[Array, "n 1"]) -> Float[Array, "n 3"]:
-    """Sum w_i c_i / O: a pixel's expected colour given a hit; grey where nothing is hit."""
+    """Sum w_i c_i / O: a pixel's expected colour, given a hit. Grey if nothing is hit."""
     return (premultiplied + 0.5e-3) / (opacity + 1e-3)

@@ -10,19 +10,17 @@ from probnerf.types import POSE_SIZE
 
 
 class Likelihood(eqx.Module):
-    """The pixel model's settings; they travel with every posterior."""
+    """The pixel model's settings. They are stored with every posterior."""
 
     lattice: foam.Lattice
     colour_sigma: float = eqx.field(static=True, default=0.1)  # s
-    mask_error: float = eqx.field(static=True, default=0.01)  # epsilon, each way
-    outlier: float = eqx.field(static=True, default=0.05)  # pi: depth from nowhere, uniform over `outlier_span`
+    mask_error: float = eqx.field(static=True, default=0.01)  # epsilon, in each direction
+    outlier: float = eqx.field(static=True, default=0.05)  # pi: rate of depth outliers, uniform over `outlier_span`
     outlier_span: float = eqx.field(static=True, default=2.5)  # cube units
     wall_sigma: float = eqx.field(static=True, default=0.02)  # floor of the model's own wall error, cube units
-    reach: float = eqx.field(
-        static=True, default=math.inf
-    )  # OBJECT: a surface so far behind the range is as good as none
-    packed: tuple[int, int] = eqx.field(static=True, default=(0, 0))  # most crossings: colour rays', all; 0: no packing
-    power: float = eqx.field(static=True, default=1.0)  # kappa; other than 1 is a stated power likelihood
+    reach: float = eqx.field(static=True, default=math.inf)  # OBJECT: surfaces farther behind the range are ignored
+    packed: tuple[int, int] = eqx.field(static=True, default=(0, 0))  # most crossings: colour rays, all; 0: no packing
+    power: float = eqx.field(static=True, default=1.0)  # kappa; any other value makes a power likelihood
     sample_pose: bool = eqx.field(static=True, default=True)
     sample_delta: bool = eqx.field(static=True, default=False)
     delta_scale: float = eqx.field(static=True, default=0.025)  # sqrt(alpha)

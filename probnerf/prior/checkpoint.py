@@ -1,4 +1,4 @@
-"""Priors on disk: one safetensors file (which cannot execute code), its arrays named, its story in the metadata."""
+"""Priors on disk: one safetensors file (which cannot execute code) with named arrays and metadata."""
 
 import hashlib
 import json
@@ -24,7 +24,7 @@ class Prior:
 
     model: ProbNeRF
     metadata: dict[str, Any]  # preset, family, seeds, revision, recipe, gate figures
-    hash: str  # of the file's bytes: names the prior in every posterior
+    hash: str  # of the file's bytes; identifies the prior in every posterior
 
 
 def _named(model: ProbNeRF) -> dict[str, Any]:
@@ -40,9 +40,10 @@ def save_prior(path: Path, model: ProbNeRF, metadata: dict[str, Any]) -> None:
 
 
 def load_prior(path: Path | None = None, preset: str | None = None) -> Prior:
-    """Read a prior; None is the one shipped with the project. `preset` states which sizes the caller needs.
+    """Read a prior. None is the one shipped with the project. `preset` is the preset that the caller requires, if any.
 
-    Raises FileNotFoundError or ValueError, in one line, for a file of another kind, damaged, or of another preset.
+    Raises FileNotFoundError if there is no file. Raises ValueError if it is not a prior, is damaged or has another
+    preset. Messages have one line.
     """
     path = SHIPPED if path is None else Path(path)
     if not path.is_file():
@@ -57,7 +58,7 @@ def load_prior(path: Path | None = None, preset: str | None = None) -> Prior:
         raise ValueError(f"{path} is not a prior of format {FORMAT} with a preset of {', '.join(PRESETS)}")
     if preset is not None and story["preset"] != preset:
         raise ValueError(f"{path} holds preset '{story['preset']}', not '{preset}'; give weights of that preset")
-    # shapes alone: to draw weights that are thrown away takes seconds
+    # shapes only: initialising weights just to replace them would take seconds
     model = jax.eval_shape(lambda key: ProbNeRF(PRESETS[story["preset"]], key), jax.random.key(0))
     named = _named(model)
     for name, leaf in named.items():

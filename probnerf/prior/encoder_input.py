@@ -1,4 +1,4 @@
-"""The encoder's input: the camera's numbers, and an image whose pixels carry their place in the object frame."""
+"""The encoder's input: camera features, and an image with each pixel's position in the object frame."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -6,11 +6,11 @@ from jaxtyping import Array, Float
 from probnerf.fields.mlp import encode, with_radius
 from probnerf.prior.networks import POINT_OCTAVES
 
-ENCODER_RADIUS = 1.25  # the encoder's picture shows this much around the cube's centre, in cube units
+ENCODER_RADIUS = 1.25  # half width of the encoder's picture at the cube's centre, cube units
 
 
 def camera_features(T_object_camera: Float[Array, "4 4"], tan_half_fov: Float[Array, ""]) -> Float[Array, "13"]:
-    """The camera's numbers for the encoder: rotation, a fifth of its position, the tangent of its half field."""
+    """Camera features for the encoder: rotation, position times 0.2, tangent of the half field of view."""
     return jnp.concatenate(
         [T_object_camera[:3, :3].reshape(-1), 0.2 * T_object_camera[:3, 3], jnp.atleast_1d(tan_half_fov)]
     )
@@ -23,10 +23,11 @@ def encoder_image(
     T_object_camera: Float[Array, "4 4"],
     tan_half_fov: Float[Array, ""],
 ) -> Float[Array, "c s s"]:
-    """Channels first: masked colour, masks (object, unknown, range), and where each pixel lies in the object frame.
+    """Channels first: masked colour, masks (object, unknown, range), and each pixel's position in the object frame.
 
-    Range becomes a point in canonical coordinates, so that the network need not learn to turn views: pooled features
-    say what is where, whatever the camera. Without range (distance < 0 marks an object pixel without one) they are 0.
+    Each range becomes a point in canonical coordinates. So the network need not learn to rotate views, and pooled
+    features do not depend on the camera. A pixel without a range has zeros. `distance` is negative for an object pixel
+    without a range.
     """
     size = rgb.shape[0]
     known = unknown < 0.5

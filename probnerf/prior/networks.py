@@ -1,6 +1,6 @@
 """The learned prior: z~ -> (RealNVP m) -> z -> (hypernetwork h) -> field weights w; and the encoder q(z | views).
 
-Paper §2.1 to §2.3. Presets change only numbers.
+Paper §2.1 to §2.3. Presets change only sizes and a few options.
 """
 
 import math
@@ -16,13 +16,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from probnerf.fields.mlp import MLPField, encoded_size
 
 CAMERA_FEATURES = 13  # rotation (9), position (3), tangent of the half field of view
-POINT_OCTAVES = 2  # of the encoding of each pixel's place in the object frame
-IMAGE_CHANNELS = 6 + encoded_size(POINT_OCTAVES, 4)  # rgb; object, unknown and range masks; the place
+POINT_OCTAVES = 2  # of the encoding of each pixel's position in the object frame
+IMAGE_CHANNELS = 6 + encoded_size(POINT_OCTAVES, 4)  # rgb; object, unknown and range masks; the position
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Every size of a model. `paper` is the paper's; `small` is for two CPU cores."""
+    """All sizes of a model. `paper` has the paper's sizes; `small` is for two CPU cores."""
 
     name: str
     latent: int  # K
@@ -34,13 +34,13 @@ class Preset:
     lattice: int  # G
     image_size: int  # encoder input, pixels
     encoder_channels: tuple[int, ...]
-    radial: bool = False  # the field also sees the distance from the body's axis
-    fitted: bool = False  # the field's first map stretches and shifts the points
-    smooth: bool = False  # SiLU in the hypernetwork, where the paper has ReLU
+    radial: bool = False  # the field's input includes the distance from the body's axis
+    fitted: bool = False  # the field first scales and shifts the points
+    smooth: bool = False  # SiLU in the hypernetwork instead of the paper's ReLU
 
     @property
     def field(self) -> MLPField:
-        """The field whose weights the hypernetwork makes."""
+        """The field whose weights the hypernetwork outputs."""
         return MLPField(
             width=self.width,
             octaves=self.octaves,
@@ -61,14 +61,14 @@ PRESETS = {
 
 
 def relu_layer(layer: eqx.nn.Linear | eqx.nn.Conv2d) -> Any:
-    """The layer with He's scale (weights of variance 2 / fan in): signals keep their size through ReLU layers."""
+    """The layer with He's scale (weights of variance 2 / fan in): ReLU layers then preserve the scale of signals."""
     assert layer.bias is not None
     scaled = layer.weight * math.sqrt(6.0)  # equinox draws uniformly with variance 1 / (3 fan in)
     return eqx.tree_at(lambda n: (n.weight, n.bias), layer, (scaled, jnp.zeros_like(layer.bias)))
 
 
 class TwoLayer(eqx.Module):
-    """Linear, ReLU, linear: arrays only, so that a model is a plain pytree for `jax.jit`."""
+    """Linear, ReLU, linear. It holds only arrays, so a model is a plain pytree for `jax.jit`."""
 
     first: eqx.nn.Linear
     last: eqx.nn.Linear
@@ -127,7 +127,7 @@ class CouplingPair(eqx.Module):
 
 def _shift_and_scale(output: Float[Array, "two_k"]) -> tuple[Array, Array]:
     shift, scale = jnp.split(output, 2)
-    return shift, 2.0 * jnp.tanh(0.5 * scale)  # bounded log-scale: a coupling can never overflow
+    return shift, 2.0 * jnp.tanh(0.5 * scale)  # bounded log-scale: a coupling cannot overflow
 
 
 class RealNVP(eqx.Module):
@@ -136,7 +136,7 @@ class RealNVP(eqx.Module):
     pairs: tuple[CouplingPair, ...]
 
     def __init__(self, dim: int, hidden: int, key: PRNGKeyArray, pairs: int = 2):
-        permutations = np.random.default_rng(0)  # a constant of the architecture, not of the seed
+        permutations = np.random.default_rng(0)  # fixed by the architecture, independent of the seed
         self.pairs = tuple(
             CouplingPair(dim, hidden, tuple(int(i) for i in permutations.permutation(dim)), k)
             for k in jax.random.split(key, pairs)
@@ -166,7 +166,7 @@ class HyperNetwork(eqx.Module):
     hidden1: eqx.nn.Linear
     weight: Float[Array, "d h"]
     bias: Float[Array, "d"]
-    scale: Float[Array, "d"]  # each weight's natural size (`MLPField.weight_scale`): outputs start as a fresh MLP's
+    scale: Float[Array, "d"]  # each weight's scale (`MLPField.weight_scale`): outputs start as in a new MLP
     smooth: bool = eqx.field(static=True)
 
     def __init__(self, latent: int, hidden: int, field: MLPField, smooth: bool, key: PRNGKeyArray):
@@ -182,7 +182,7 @@ class HyperNetwork(eqx.Module):
     def __call__(self, z: Float[Array, "k"]) -> Float[Array, "d"]:
         activation = jax.nn.silu if self.smooth else jax.nn.relu
         h = activation(self.hidden1(activation(self.hidden0(z))))
-        # dividing here, not in the weights, keeps Adam's steps in w as small as the bias's
+        # divide here, not in the weights, so that Adam's steps in w are as small as those of the bias
         return jax.lax.stop_gradient(self.scale) * (self.weight @ h / math.sqrt(h.shape[0]) + self.bias)
 
 
@@ -215,17 +215,17 @@ class Encoder(eqx.Module):
         h = image
         for convolution in self.convolutions:
             h = jax.nn.relu(convolution(h))
-        # pooled: a feature knows its place in the object frame, not in the picture
+        # pooled: features encode positions in the object frame, not in the picture
         parts = [jnp.mean(h, axis=(1, 2)), jnp.max(h, axis=(1, 2)), jax.nn.relu(self.camera(camera))]
         h = jax.nn.relu(self.hidden(jnp.concatenate(parts)))
         mean, log_precision = jnp.split(self.output(h), 2)
-        # starts at precision 20: at unit noise the decoder would learn to ignore z
+        # starts at precision 20: with unit noise, the decoder would learn to ignore z
         return mean, jnp.exp(3.0 + 6.0 * jnp.tanh(log_precision / 6.0))
 
     def __call__(
         self, images: Float[Array, "j c s s"], cameras: Float[Array, "j 13"], used: Float[Array, "j"]
     ) -> tuple[Float[Array, "k"], Float[Array, "k"]]:
-        """Mean and precision of q(z | views): precisions add, means weigh by them. `used` is 0 for a missing view."""
+        """Mean and precision of q(z | views): precisions add and weight the means. `used` is 0 for a missing view."""
         mean, precision = jax.vmap(self.potential)(images, cameras)
         precision = precision * used[:, None]
         prior = jnp.exp(self.prior_log_precision)
@@ -234,10 +234,11 @@ class Encoder(eqx.Module):
 
 
 class Recognition(eqx.Module):
-    """q(z | the object's exact description): training's scaffold, thrown away afterwards.
+    """q(z | the object's exact description). It is used only in training and discarded afterwards.
 
-    The paper trains the decoder through the picture encoder; a procedural family knows its objects, and a decoder that
-    is told z cleanly learns several times faster. The picture encoder then learns to give the same z.
+    The paper trains the decoder through the picture encoder. Here the exact description of a procedural object is
+    known. A decoder trained with z from this description learns several times faster. The picture encoder then learns
+    to predict the same z.
     """
 
     hidden: TwoLayer
@@ -275,7 +276,7 @@ class ProbNeRF(eqx.Module):
 
     @property
     def field(self) -> MLPField:
-        """The field that `decode`'s weights drive."""
+        """The field that takes `decode`'s weights."""
         return self.preset.field
 
     @property

@@ -1,6 +1,6 @@
-"""The encoder's guesses of an object, at every yaw: where climbs start (`probnerf.sampling.modes`).
+"""The encoder's guesses of an object at given yaws. Gradient ascents start from them (`probnerf.sampling.modes`).
 
-It needs the camera in the canonical object frame, which the unknown yaw turns.
+The encoder needs the camera pose in the canonical object frame. That depends on the unknown yaw.
 """
 
 import equinox as eqx
@@ -16,11 +16,11 @@ from probnerf.types import POSE_SIZE, Pose, on_device
 
 
 class EncoderPicture(eqx.Module):
-    """What the encoder sees: a square view of the cube by a camera that looks at its centre (view frame)."""
+    """The encoder's picture: a square view of the cube by a camera that looks at its centre (view frame)."""
 
     rgb: Float[Array, "s s 3"]  # in [0, 1]
-    distance: Float[Array, "s s"]  # along the ray; 0: not the object, -1: the object, at an unknown range
-    unknown: Float[Array, "s s"]  # 1 where the pixel says nothing
+    distance: Float[Array, "s s"]  # along the ray; 0: not the object, -1: the object at an unknown range
+    unknown: Float[Array, "s s"]  # 1 if the pixel is not informative
     T_view_camera: Float[Array, "4 4"]
     tan_half_fov: Float[Array, ""]
 
@@ -37,7 +37,7 @@ def potential_at(model: ProbNeRF, picture: EncoderPicture, pose: Pose) -> tuple[
 
 
 def even_yaws(count: int) -> Float[np.ndarray, "count"]:
-    """Radians, from -pi."""
+    """Evenly spaced yaws in radians, from -pi."""
     return (np.arange(count) * (2.0 * np.pi / count) - np.pi).astype(np.float32)
 
 
@@ -46,7 +46,7 @@ def encoder_positions(
 ) -> Float[Array, "y_draws d"]:
     """Positions with z = mean + spread N(0, 1 / precision) of the encoder at the given yaws, `draws` at each.
 
-    All else of the pose is as perception guessed it.
+    The rest of the pose is perception's guess.
     """
     return _encoder_positions(key, model, picture, on_device(yaws), draws, spread)
 
@@ -54,7 +54,7 @@ def encoder_positions(
 def guesses(
     key: PRNGKeyArray, model: ProbNeRF, picture: EncoderPicture, count: int, sample_pose: bool = True
 ) -> Float[Array, "count d"]:
-    """Where climbs start: the encoder's mean at even yaws; where the pose is known, latents drawn from it there."""
+    """Starts of ascents: the encoder's means at even yaws. If the pose is known, its draws there."""
     if sample_pose:
         return encoder_positions(key, model, picture, even_yaws(count), 1, 0.0)
     return encoder_positions(key, model, picture, np.zeros(1, np.float32), count, 1.0)[:, : model.latent]

@@ -1,8 +1,8 @@
 """From opacity to *solid* space, on a voxel grid over the cube [-1, 1]^3.
 
 Symbols: G voxels per axis, index order [i_x, i_y, i_z], voxel width 2/G, voxel centres at -1 + (i + 1/2) 2/G; cube
-units throughout. The same operator makes a hypothesis' occupancy and the ground truth (there a wall is a voxel that
-meets the true solid).
+units throughout. The same operator gives a hypothesis' occupancy and the ground truth. For the ground truth, a wall is
+a voxel that intersects the true solid.
 """
 
 import numpy as np
@@ -23,9 +23,9 @@ def voxel_centres(grid: int) -> Float[np.ndarray, "G G G 3"]:
 
 
 def above_plane(grid: int) -> Bool[np.ndarray, "G"]:
-    """Which levels of voxels (last axis of a grid) stand above the support plane: those whose centre is not below it.
+    """Which voxel levels (last axis of a grid) are above the support plane: those whose centre is not below it.
 
-    A level whose centre lies in the plane counts, as it does in `solid`. No grid of a multiple of eight has such a one.
+    A level whose centre lies in the plane counts, as in `solid`. If the grid is a multiple of eight, there is none.
     """
     return _centre_z(grid) >= BASE_Z
 
@@ -37,7 +37,7 @@ def voxel_index(points: Float[ArrayLike, "... 3"], grid: int) -> Int[np.ndarray,
     for axis in range(3):
         p = points[..., axis]
         inside &= (p >= -1.0) & (p <= 1.0)
-        # Clipped, so that a point on the cube's far faces belongs to the last voxel.
+        # Clip, so that a point on the cube's upper faces belongs to the last voxel.
         index = index * grid + np.clip(np.floor((p + 1.0) * (0.5 * grid)), 0, grid - 1).astype(np.int64)
     return np.where(inside, index, -1)
 
@@ -47,13 +47,14 @@ def solid(
 ) -> Bool[np.ndarray, "... G G G"]:
     """Solid occupancy of opacity grids in the view frame: a float in [0, 1], or u8 as round(255 * opacity).
 
-    Opacity >= 0.5 marks a wall. Walls are dilated by one voxel (6-connected), every voxel that 6-connected empty space
-    cannot reach from outside the cube becomes solid, and the dilation is taken back by an erosion: a closed can is
-    solid, the cavity of an open cup is empty. (Filling between the two steps of the closing matters: a closing alone
-    cannot seal a pinhole in a wall one or two voxels thick.) The support plane is no wall (a shape whose unseen bottom
-    is open is open), but a shape ends at `base`, on which it stands (z of the view frame): nothing below is occupied.
-    Where that is above the measured plane, the table is higher than measured, and fills what lies between: the shape's
-    lowest layer goes on down to the plane.
+    Opacity >= 0.5 marks a wall. Walls are dilated by one voxel (6-connected). Every voxel that is not 6-connected to
+    the outside of the cube through empty space becomes solid. An erosion then reverses the dilation. So a closed can is
+    solid, and the cavity of an open cup is empty. (The filling must come between dilation and erosion: a closing alone
+    cannot seal a pinhole in a wall of one or two voxels.)
+
+    The support plane is not a wall: a shape with an open, unseen bottom stays open. A shape ends at `base`, on which it
+    stands (z of the view frame), and nothing below is occupied. If `base` is above the measured plane, the table is
+    higher than measured. The shape's lowest layer then continues down to the plane.
     """
     opacity = np.asarray(opacity)
     if opacity.ndim < 3 or len(set(opacity.shape[-3:])) != 1:
@@ -63,7 +64,7 @@ def solid(
     grid = opacity.shape[-1]
     flat = walls.reshape(-1, grid, grid, grid)
     filled = np.stack([_fill(wall) for wall in flat]) if len(flat) else flat
-    # Last, not first: a bottom that is drawn a little below the plane still seals the object.
+    # Last, not first, so that a bottom slightly below the plane still seals the object.
     bases = np.broadcast_to(np.asarray(base, np.float64), walls.shape[:-3]).ravel()
     level = _centre_z(grid)
     plane = np.searchsorted(level, BASE_Z)
@@ -81,14 +82,14 @@ def voxel_surface(occupied: Bool[np.ndarray, "G G G"]) -> Float[np.ndarray, "n 3
     faces = []
     for axis in range(3):
         index = np.argwhere(np.diff(padded, axis=axis)).astype(np.float64)
-        index -= 0.5  # the centre of voxel i of the padded grid is -1 + (i - 1/2) width
+        index -= 0.5  # voxel i of the padded grid has its centre at -1 + (i - 1/2) width
         index[:, axis] += 0.5
         faces.append(-1.0 + index * width)
     return np.concatenate(faces)
 
 
 def coarsen(occupied: Bool[np.ndarray, "... G G G"], grid: int) -> Bool[np.ndarray, "... g g g"]:
-    """Occupancy on a coarser grid: a large voxel is occupied if any voxel in it is (it meets the solid)."""
+    """Occupancy on a coarser grid: a large voxel is occupied if any voxel in it is."""
     factor, rest = divmod(occupied.shape[-1], grid)
     if rest or factor < 1:
         raise ValueError(f"a grid of {occupied.shape[-1]} voxels does not divide into {grid}")
@@ -101,11 +102,11 @@ def _centre_z(grid: int) -> Float[np.ndarray, "G"]:
 
 
 def _fill(walls: Bool[np.ndarray, "G G G"]) -> Bool[np.ndarray, "G G G"]:
-    """Dilate walls by one voxel, fill what empty space cannot reach from outside, erode by one."""
+    """Dilate walls by one voxel, fill voxels that the outside cannot reach, erode by one voxel."""
     filled = np.zeros_like(walls)
-    box = ndimage.find_objects(walls.view(np.uint8))  # of all walls: the rest is outside
+    box = ndimage.find_objects(walls.view(np.uint8))  # bounding box of all walls; the rest is outside
     if box:
-        # room to dilate, and around it the outside that empty space is reached from
+        # a margin for the dilation, then a border of outside voxels
         grown = _dilate(np.pad(walls[box[0]], 2))
         empty, _ = ndimage.label(~grown, structure=_SIX_CONNECTED)
         filled[box[0]] = _erode(empty != empty[0, 0, 0])[2:-2, 2:-2, 2:-2]
@@ -113,7 +114,7 @@ def _fill(walls: Bool[np.ndarray, "G G G"]) -> Bool[np.ndarray, "G G G"]:
 
 
 def _dilate(mask: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
-    """6-connected dilation inside the array: six shifted ORs, an order of magnitude faster than scipy here."""
+    """6-connected dilation inside the array: six shifted ORs, about ten times faster than scipy here."""
     grown = mask.copy()
     for axis in range(3):
         target, source = np.moveaxis(grown, axis, 0), np.moveaxis(mask, axis, 0)
@@ -123,5 +124,5 @@ def _dilate(mask: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
 
 
 def _erode(mask: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
-    """6-connected erosion; what lies outside the array counts as occupied."""
+    """6-connected erosion. Voxels outside the array count as occupied."""
     return ~_dilate(~mask)

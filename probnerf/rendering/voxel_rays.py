@@ -1,4 +1,4 @@
-"""Rays from one point through a voxel grid over the cube [-1, 1]^3: where they cross a box, and what they meet there.
+"""Rays from one point through a voxel grid over the cube [-1, 1]^3: crossings with a box, and voxel values there.
 
 Symbols: G voxels per axis, n rays, k steps of one length along each; cube units.
 """
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 from numpy.typing import ArrayLike
 
-_SAMPLES = 500_000  # points that are looked up at a time
+_SAMPLES = 500_000  # points per chunk of lookups
 
 
 def crossed(
@@ -18,16 +18,16 @@ def crossed(
     low: Float[np.ndarray, "3"],
     high: Float[np.ndarray, "3"],
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Distance at which each ray enters and leaves a box; it enters after it leaves where it misses."""
+    """Distances at which each ray enters and leaves a box. If it misses, the first is larger than the second."""
     d = np.where(np.abs(directions) < 1e-9, 1e-9, directions)
     a, b = (low - origin) / d, (high - origin) / d
     return np.maximum(np.minimum(a, b).max(axis=1), 0.0), np.maximum(a, b).min(axis=1)
 
 
 def nearest(bordered: Shaped[np.ndarray, "..."], *coordinates: Float[np.ndarray, "..."]) -> np.ndarray:
-    """The voxel's value at points of the cube (or square) given by their coordinates, those outside it the border's.
+    """The voxel values at points of the cube (or square). Points outside have the border's value.
 
-    `bordered` holds the voxels with one more on each side, which clipping leads to: `np.pad(values, 1)`.
+    `bordered` holds the voxels with one more on each side: `np.pad(values, 1)`. Coordinates are clipped to that border.
     """
     wide = bordered.shape[0]
     index = np.zeros((), np.int32)
@@ -45,10 +45,10 @@ def met(
     low: Float[ArrayLike, "3"] = (-1.0, -1.0, -1.0),
     high: Float[ArrayLike, "3"] = (1.0, 1.0, 1.0),
 ) -> Iterator[tuple[Int[np.ndarray, "m"], Float[np.ndarray, "m k"], Shaped[np.ndarray, "m k"]]]:
-    """(rays, distances, values at them), some rays at a time, of those that cross a box: the cube, or low to high.
+    """Yields (rays, distances, values there) in chunks of rays that cross a box: the cube, or low to high.
 
-    Directions are unit. Distances start `first` steps behind where the ray enters the box and go on in steps of `step`
-    voxels, at least to where it leaves. Points are computed in f32.
+    Directions are unit vectors. Distances start `first` steps after the ray enters the box. They increase in steps of
+    `step` voxels, at least until it leaves the box. Points are computed in f32.
     """
     near, far = crossed(origin, directions, np.asarray(low), np.asarray(high))
     rays = np.flatnonzero(far > near)
