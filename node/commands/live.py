@@ -240,7 +240,7 @@ class LiveNode:
             self.inferences += 1
             h = update.hypotheses
             self._record(h, look)
-            news = {Change.NEW: "first seen", Change.MOVED: "has moved: begun anew"}
+            news = {Change.NEW: "first seen", Change.MOVED: "has moved: inference restarted"}
             news |= {Change.VIEW: "seen from another side", Change.CONTINUED: "sampling went on"}
             out.print(
                 f"object {h.object_id} {news[update.change]}: {h.result} at stage {h.stage},"

@@ -33,11 +33,11 @@ LAYERS = {  # parts that can be hidden: label, scene node
 FREE, BLOCKED = "#1a9850", "#d73027"
 _STOPPED = {
     StopReason.CONVERGED: "the sampler finished",
-    StopReason.BUDGET: "the time was up before the sampler had finished",
-    StopReason.STAGES: "stopped after as many stages as asked for",
-    StopReason.STOPPED: "stopped by the program that asked",
-    StopReason.INTERRUPTED: "stopped by hand",
-    StopReason.UNDERWAY: "the sampler goes on",
+    StopReason.BUDGET: "the time was up before the sampler finished",
+    StopReason.STAGES: "stopped at the requested number of stages",
+    StopReason.STOPPED: "stopped by the calling program",
+    StopReason.INTERRUPTED: "stopped by the user",
+    StopReason.UNDERWAY: "the sampler is still running",
 }
 
 

@@ -81,7 +81,7 @@ def _read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
         data = np.frombuffer(path.read_bytes(), np.uint8)
         decoded = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
         if decoded is None:
-            raise ValueError(f"{path} cannot be decoded; copy it again, or take it away")
+            raise ValueError(f"{path} cannot be decoded; copy it again, or remove it")
         image = decoded
     if image.dtype == np.uint16:  # depth, or a camera's raw grey
         image = (image >> 8).astype(np.uint8)

@@ -26,7 +26,7 @@ class Playback:
         self.log, self.pace = log, pace
         self.start_s, self.end_s = start_s, math.inf if end_s is None else end_s
         if not (math.isfinite(pace) and pace >= 0):
-            raise ValueError(f"{log.path}: pace {pace:g} is none; give 1 for the recording's own, or 0 for the fastest")
+            raise ValueError(f"{log.path}: pace is {pace:g}; give 1 for the recording's own, or 0 for the fastest")
         if not 0 <= self.start_s <= self.end_s:
             until = "on" if end_s is None else f"to {end_s:g} s"
             raise ValueError(

@@ -74,7 +74,7 @@ class Recorder:
         except OSError as error:
             why = f"cannot be written ({error.strerror}); give another place"
             if self.path.exists():
-                why = "is there already; give another name, or move it away"
+                why = "is there already; give another name, or move the file"
             raise OSError(f"{self.path} {why}") from None
         self._writer = Writer(
             self._stream,

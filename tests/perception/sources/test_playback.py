@@ -54,8 +54,8 @@ def test_it_keeps_the_pace(log: Log) -> None:
         ((0.0, -1.0, None), "from -1 s on is not a range"),
         ((0.0, 0.5, 0.2), "from 0.5 s to 0.2 s is not a range"),
         ((0.0, float("nan"), None), "from nan s on is not a range"),
-        ((-1.0, 0.0, None), "pace -1 is none; give 1 for the recording's own"),
-        ((float("inf"), 0.0, None), "pace inf is none"),
+        ((-1.0, 0.0, None), "pace is -1; give 1 for the recording's own"),
+        ((float("inf"), 0.0, None), "pace is inf"),
     ],
 )
 def test_what_is_no_range_is_named(log: Log, given: tuple, says: str) -> None:
