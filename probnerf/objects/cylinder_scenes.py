@@ -1,7 +1,7 @@
-"""Scenes of the analytic field, and their posterior by brute force: a right answer with no training and no sampling.
+"""Scenes of the analytic field, and their posterior on a grid: a reference without training or sampling.
 
-Pixels are drawn from the very density that `model.pixel_terms` evaluates, so the posterior is well-posed; x, y and
-log-scale are known and ranges unbiased (pose_sigma = 0), which leaves yaw, handle length and radius to a grid.
+Pixels are drawn from the density that `pixel_terms` evaluates, so the model is correct. x, y and log-scale are known
+and ranges are unbiased (pose_sigma = 0). The grid covers the unknowns: yaw, handle length and radius.
 """
 
 from collections.abc import Callable
@@ -23,13 +23,13 @@ from probnerf.likelihood.settings import Likelihood
 from probnerf.rendering import foam
 from probnerf.types import FREE, OBJECT, UNKNOWN, Observation, Rays
 
-Args = tuple[CylinderModel, Likelihood, Observation, Float[Array, "n m"]]  # what `model.log_likelihood` takes
+Args = tuple[CylinderModel, Likelihood, Observation, Float[Array, "n m"]]  # arguments of `dispatch.log_likelihood`
 
 
 def grid_of_rays(columns: int, rows: int, elevation: float = 20.0, distance: float = 4.0, azimuth: float = 0.0) -> Rays:
     """Pixels of a camera `azimuth` degrees from +x and `elevation` above the table that looks at the cylinder.
 
-    Left column first; they cover 2.3 by 1.7 cube units around the object. At azimuth 0 the image's left is -y.
+    The left column comes first. They cover 2.3 by 1.7 cube units around the object. At azimuth 0, image left is -y.
     """
     e, a = np.deg2rad(elevation), np.deg2rad(azimuth)
     target = np.array([0.0, 0.0, -0.2])
@@ -60,11 +60,11 @@ def draw_pixels(
     range_sigma: float = 0.02,
     pose_sigma: Float[Array, "5"] | None = None,
 ) -> Observation:
-    """One observation of the object at `position`: where each ray ends, the mask bit, the depth and the colour.
+    """Simulate an observation of the object at `position`: the end of each ray, mask, depth and colour.
 
-    Pixels that are not `known` are UNKNOWN and say nothing; without `depth`, OBJECT pixels carry colour alone. They are
-    drawn from `pixel_terms`' density at a `reach` without end and a power of 1. Without `pose_sigma` only the yaw is
-    unknown.
+    Pixels that are not `known` are UNKNOWN and carry no information. Without `depth`, OBJECT pixels have only colour.
+    Pixels are drawn from the density of `pixel_terms` with infinite `reach` and a power of 1. Without `pose_sigma`,
+    only the yaw of the pose is unknown.
     """
     n = rays.origin.shape[0]
     keys = jax.random.split(key, 6)
@@ -101,7 +101,7 @@ def draw_pixels(
 
 
 def object_first(observation: Observation, colour_count: int) -> Observation:
-    """The same pixels, OBJECT ones first, so that only `colour_count` rays pay for colour."""
+    """The same pixels, OBJECT ones first, so that colour is computed only for `colour_count` rays."""
     order = jnp.argsort(observation.status != OBJECT, stable=True)
     found = int(jnp.sum(observation.status == OBJECT))
     if found > colour_count:
@@ -110,7 +110,7 @@ def object_first(observation: Observation, colour_count: int) -> Observation:
     return replace(sorted_rays, pose_sigma=observation.pose_sigma, colour_count=colour_count)
 
 
-CHUNK = 512  # positions whose likelihood is evaluated at a time
+CHUNK = 512  # positions per likelihood evaluation
 YAW_OF = {"seen": 60.0, "hidden": 180.0, "half": -70.0}  # degrees; "half": the left half, with the handle, is unknown
 
 
@@ -125,9 +125,8 @@ def scene(
 ) -> Args:
     """One view of a cylinder whose handle is "seen", "hidden" behind it, or in the picture's unknown half ("half").
 
-    So it is for a camera at azimuth 0 (degrees).
-
-    Returns the arguments of `model.log_likelihood`; every scene of one size has the same shapes.
+    This holds for a camera at azimuth 0 (degrees). Returns the arguments of `log_likelihood`. All scenes of one size
+    have the same array shapes.
     """
     rays = grid_of_rays(columns, rows, azimuth=azimuth)
     bare = foam.Lattice(cubes)
@@ -144,7 +143,7 @@ def scene(
 
 @dataclass(frozen=True)
 class GridPosterior:
-    """The posterior over yaw, z_0 (handle length) and z_1 (radius) on a grid that is refined where mass is."""
+    """The posterior over yaw, z_0 (handle length) and z_1 (radius) on a grid that is refined where the mass is."""
 
     cells: np.ndarray  # f64[c, 3] (yaw in [0, 2 pi), z_0, z_1) of the centres
     widths: np.ndarray  # f64[3] of every cell
@@ -164,10 +163,10 @@ class GridPosterior:
         log_likelihood: Callable[[Any, Float[Array, "p d"]], Float[Array, "p"]],
         args: Any,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """`count` points (yaw, z_0, z_1) and their weights, which stand for the posterior inside the cells, too.
+        """`count` points (yaw, z_0, z_1) and their weights. They represent the posterior, also within cells.
 
-        They are drawn evenly within cells and weighed by the density there. `integrate` leaves a cell wide along what
-        moves neither yaw nor evidence, such as a hidden handle's length.
+        Points are uniform within cells and weighted by the density. This is needed because `integrate` keeps cells wide
+        along axes that affect neither yaw nor evidence, such as the length of a hidden handle.
         """
         chosen = rng.choice(len(self.cells), count, p=self.probability)
         points = self.cells[chosen] + (rng.random((count, 3)) - 0.5) * self.widths
@@ -183,7 +182,7 @@ def yaw_histogram(yaw: np.ndarray, probability: np.ndarray, bins: int = 12) -> n
 
 
 def total_variation(p: np.ndarray, q: np.ndarray) -> float:
-    """Half the sum of absolute differences."""
+    """Total variation distance: half the sum of absolute differences."""
     return 0.5 * float(np.abs(p - q).sum())
 
 
@@ -195,11 +194,11 @@ def integrate(
     reach: float = 4.0,
     chunk: int = CHUNK,
 ) -> GridPosterior:
-    """Midpoint rule on cells that are halved along one axis after the other while that moves the answer.
+    """Midpoint rule on cells. They are halved along one axis after another until the result stops changing.
 
-    The answer is the log-evidence (nats) and the yaw histogram; moved means by more than `tolerance`. The likelihood
-    depends on (a, b) through the yaw alone, so their radius integrates out. Cells whose density is e^-16 of the best
-    (e^-60 at first, when a narrow peak can stand between centres) are dropped.
+    The result is the log-evidence (nats) and the yaw histogram. A change of at most `tolerance` does not count. The
+    likelihood depends on (a, b) only through the yaw, so their radius integrates out. Cells with a density below e^-16
+    of the best are dropped. At first the limit is e^-60, because a narrow peak can lie between centres.
     """
 
     def mass_of(cells: np.ndarray, widths: np.ndarray) -> GridPosterior:

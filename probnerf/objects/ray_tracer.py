@@ -1,6 +1,6 @@
-"""Pictures and solid truth of tabletop objects: ray tracing, cameras, occupancy. Lengths are in cube units.
+"""Pictures and true occupancy of tabletop objects, by ray tracing. Lengths are in cube units.
 
-Vessel walls are met in closed form, the other parts by sphere tracing (Hart 1996).
+Hits on vessel walls have a closed form. Other parts use sphere tracing (Hart 1996).
 """
 
 from functools import partial
@@ -22,33 +22,33 @@ from probnerf.objects.tabletop import (
 )
 
 STEPS = 48
-HIT = 1e-3  # a ray that comes this close (canonical units) to the surface has hit it
+HIT = 1e-3  # a ray within this distance (canonical units) of the surface has hit it
 _DIFFERENCE = 1e-3  # step of the normals' finite difference
 _CORNERS = np.array([[1, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]], np.float32)
-_SEAM = 2e-6  # neighbouring edges overlap by this, so that no ray slips between them
+_SEAM = 2e-6  # overlap of neighbouring edges, so that no ray passes between them
 
 
 class RenderedView(eqx.Module):
     """Square pictures of one object (or, with leading axes, of several)."""
 
-    rgb: Float[Array, "size size 3"]  # in [0, 1], white where there is no object
+    rgb: Float[Array, "size size 3"]  # in [0, 1]; white outside the object
     mask: Bool[Array, "size size"]
-    range: Float[Array, "size size"]  # distance along the ray, inf where there is no object
+    range: Float[Array, "size size"]  # distance along the ray; inf outside the object
 
 
 def _vessel_hit(
     outline: Float[Array, "17 2"], origin: tuple[Array, Array, Array], direction: tuple[Array, Array, Array]
 ) -> tuple[Array, Array]:
-    """First meeting with the revolved outline: distance (inf: none) and the z part of the unit normal, unsigned.
+    """First hit on the surface of revolution: distance (inf: none) and the unsigned z component of the unit normal.
 
-    An edge of slope k = dr/dz sweeps the cone x^2 + y^2 = (r_a + k (z - z_a))^2, quadratic in t; a flat edge sweeps a
-    plane. A loop over edges, although they are few: XLA would compute an unrolled chain once for each of its readers.
+    An edge of slope k = dr/dz sweeps the cone x^2 + y^2 = (r_a + k (z - z_a))^2, quadratic in t. A flat edge sweeps a
+    plane. There are few edges, but they are in a loop: XLA would compute an unrolled chain once for each of its uses.
     """
     (ox, oy, oz), (dx, dy, dz) = origin, direction
     oo, od, dd = ox * ox + oy * oy, ox * dx + oy * dy, dx * dx + dy * dy
 
     def edge(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        """The nearest hit so far and its normal's height, with what edge i adds."""
+        """Update the nearest hit so far and its normal's z component with edge i."""
         best, normal_z = state
         (ra, za), (rb, zb) = outline[i], outline[i + 1]
         rise = zb - za
@@ -77,8 +77,8 @@ def _vessel_hit(
 def _trace(
     obj: TabletopObject, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"]
 ) -> tuple[Bool[Array, "n"], Float[Array, "n"], Float[Array, "n 3"]]:
-    """The vessel's walls in closed form; carton, spout and handle, few terms each, by stepping along the ray."""
-    # In the canonical frame, whose axes are the cube's: only origins and lengths change.
+    """Vessel walls in closed form. Carton, spout and handle have few terms each and use sphere tracing."""
+    # In the canonical frame. Its axes are parallel to the cube's: only origins and lengths change.
     ox, oy, oz = to_canonical(obj, origins)
     dx, dy, dz = directions[:, 0], directions[:, 1], directions[:, 2]
 
@@ -92,7 +92,7 @@ def _trace(
     z0, z1 = slab(oz, dz, obj.lower[2], obj.upper[2])
     near = jnp.maximum(jnp.maximum(jnp.maximum(x0, y0), z0), 0.0)
     reach = jnp.minimum(jnp.minimum(x1, y1), z1) - near
-    ox, oy, oz = ox + near * dx, oy + near * dy, oz + near * dz  # single precision wants a near origin
+    ox, oy, oz = ox + near * dx, oy + near * dy, oz + near * dz  # single precision needs a nearby origin
 
     wall, normal_z = _vessel_hit(obj.outline, (ox, oy, oz), (dx, dy, dz))
     wall = jnp.where((obj.kind == CARTON) | (wall > reach), jnp.inf, wall)
@@ -102,7 +102,7 @@ def _trace(
         return jnp.minimum(*canonical_parts(obj, x, y, z))
 
     def step(_: int, t: Array) -> Array:
-        # A converged ray keeps stepping by its residual, of either sign: that refines it.
+        # A converged ray continues to step by its residual, of either sign. This refines the hit.
         return jnp.where(t > far, t, t + distance(ox + t * dx, oy + t * dy, oz + t * dz))
 
     stepped = jax.lax.fori_loop(0, STEPS, step, jnp.zeros_like(ox))
@@ -112,7 +112,7 @@ def _trace(
     t = jnp.where(on_part, stepped, jnp.where(jnp.isfinite(wall), wall, 0.0))
     hit = on_part | jnp.isfinite(wall)
 
-    # Parts' normals by differences over a tetrahedron's corners: four distances, and no gradient of min to go wrong.
+    # The parts' normals, by differences over a tetrahedron's corners: four distances, and no gradient of a minimum.
     def corner(i: Array, gradient: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         ex, ey, ez = jnp.asarray(_CORNERS)[i]
         d = distance(x + _DIFFERENCE * ex, y + _DIFFERENCE * ey, z + _DIFFERENCE * ez)
@@ -124,7 +124,7 @@ def _trace(
 
     x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
     per_r = jnp.sqrt(jnp.maximum(1.0 - normal_z * normal_z, 0.0)) / jnp.maximum(jnp.sqrt(x * x + y * y), 1e-9)
-    facing = jnp.where(per_r * (x * dx + y * dy) + normal_z * dz > 0.0, -1.0, 1.0)  # walls are met from outside
+    facing = jnp.where(per_r * (x * dx + y * dy) + normal_z * dz > 0.0, -1.0, 1.0)  # the hit normal faces the ray
     normals = jnp.stack(
         [
             jnp.where(on_part, nx / length, facing * per_r * x),
@@ -141,7 +141,7 @@ def _trace(
 def trace(
     obj: TabletopObject, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"]
 ) -> tuple[Bool[Array, "n"], Float[Array, "n"], Float[Array, "n 3"]]:
-    """First hits of unit rays from outside ONE object: hit, distance (a miss: inf), colour (a miss: white)."""
+    """First hits of unit rays from outside ONE object: hit, distance (inf for a miss), colour (white for a miss)."""
     return _trace(obj, origins, directions)
 
 
@@ -176,7 +176,7 @@ def _any_in_voxel(inside: Bool[Array, "m m m"]) -> Bool[Array, "g g g"]:
 
 
 def solid_occupancy(obj: TabletopObject, grid: int = 64) -> Bool[Array, "grid grid grid"]:
-    """Voxels of [-1, 1]^3 that meet the solid, index order [ix, iy, iz], centres at -1 + (i + 0.5) 2 / grid.
+    """Voxels of [-1, 1]^3 that intersect the solid, index order [ix, iy, iz], centres at -1 + (i + 0.5) 2 / grid.
 
     A voxel counts if the distance is <= 0 at any of 27 points of the closed voxel: its corners, the middles of its
     edges and faces, and its centre (a lattice at half the voxels' spacing).
@@ -185,5 +185,5 @@ def solid_occupancy(obj: TabletopObject, grid: int = 64) -> Bool[Array, "grid gr
 
 
 def handle_occupancy(obj: TabletopObject, grid: int = 64) -> Bool[Array, "grid grid grid"]:
-    """Voxels that meet the handle outside the body, by the same 27 points as `solid_occupancy`."""
+    """Voxels that intersect the handle outside the body, by the same 27 points as `solid_occupancy`."""
     return _any_in_voxel(_half_lattice(obj, grid)[1])

@@ -1,9 +1,9 @@
-"""The tabletop family: vessels and cartons with exact truth, drawn from a seed.
+"""The tabletop family: vessels and cartons with exact geometry, drawn from a seed.
 
 Canonical frame (cube units): z up, the body's axis at x = y = 0, the base on z = BASE_Z, the handle (or a carton's
 front face) at +x, a spout at -x. The larger of the body's longest horizontal side and its height is BODY_EXTENT;
-handles and spouts are not part of the body. The object stands in the cube after a small similarity about its support
-point (slack).
+handles and spouts are not part of the body. The object's placement in the cube adds a small similarity transform about
+its support point (slack).
 
 Symbols: (r, z) are cylindrical coordinates; s in [0, 1] is the height as a fraction of the body's.
 """
@@ -56,7 +56,7 @@ class TabletopObject(eqx.Module):
     label: Float[Array, "5"]  # azimuth, cosine of half width, half width on a box's face (of 1), s from, s to
     waves: Float[Array, "2 3 4"]  # two patterns: sums of three sinusoids (wave vector, phase)
     pattern_level: Float[Array, "2"]
-    lid_start: Float[Array, ""]  # above this s the lid's paint; > 1 where there is none
+    lid_start: Float[Array, ""]  # the lid's paint starts at this s; > 1 if there is no lid
     light: Float[Array, "3"]  # unit vector towards the light
     ambient: Float[Array, "3"]
     lamp: Float[Array, "3"]
@@ -66,10 +66,10 @@ class TabletopObject(eqx.Module):
 
 
 def _outline_distance(outline: Float[Array, "17 2"], r: Array, z: Array) -> Array:
-    """Exact signed distance to the solid of revolution; the closing edge on the axis is no surface and is left out.
+    """Exact signed distance to the solid of revolution; the edge on the axis is not a surface and is excluded.
 
-    The sign is the parity of crossings of the half line towards +r, which never meets the axis. Edges are unrolled: one
-    fused elementwise loop is several times faster on a CPU than a reduction over an edge axis.
+    The sign is the parity of the outline's crossings with the half line towards +r, which never crosses the axis. Edges
+    are unrolled: on a CPU, one fused elementwise loop is several times faster than a reduction over an edge axis.
     """
     start, edge = outline[:-1], outline[1:] - outline[:-1]
     squared = jnp.sum(edge * edge, axis=-1)
@@ -142,7 +142,7 @@ def canonical_parts(obj: TabletopObject, x: Array, y: Array, z: Array) -> tuple[
 
 
 def canonical_distances(obj: TabletopObject, x: Array, y: Array, z: Array) -> tuple[Array, Array]:
-    """Body (spout included) and handle distances of canonical coordinates."""
+    """Distances of canonical coordinates to the body (including the spout) and to the handle."""
     rest, handle = canonical_parts(obj, x, y, z)
     revolved = _outline_distance(obj.outline, jnp.sqrt(x * x + y * y), z)
     return jnp.minimum(rest, jnp.where(obj.kind == CARTON, -ABSENT, revolved)), handle
@@ -160,9 +160,9 @@ def to_canonical(obj: TabletopObject, points: Float[Array, "... 3"]) -> tuple[Ar
 def part_distances(
     obj: TabletopObject, points: Float[Array, "... 3"]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Signed distances (cube units) to the body (with its spout) and to the handle; at least 5 where there is none.
+    """Signed distances (cube units) to the body (with its spout) and to the handle; at least 5 if there is no handle.
 
-    The handle alone is where the second is <= 0 and the first is > 0: its ends reach into the wall.
+    The handle's ends extend into the wall. So a point is only in the handle if the second is <= 0 and the first is > 0.
     """
     body, handle = canonical_distances(obj, *to_canonical(obj, points))
     return body * obj.scale, handle * obj.scale
@@ -171,8 +171,8 @@ def part_distances(
 def signed_distance(obj: TabletopObject, points: Float[Array, "... 3"]) -> Float[Array, "..."]:
     """Signed distance (cube units) of points in the cube to ONE object: negative inside.
 
-    The minimum over the parts' exact distances: exact outside, and its sign is exact everywhere. Inside, it is exact
-    where the deepest part's nearest surface is not covered by another part; where parts overlap its magnitude is a
+    It is the minimum over the parts' exact distances. It is exact outside, and its sign is exact everywhere. Inside, it
+    is exact if the deepest part's nearest surface is not covered by another part. If parts overlap, its magnitude is a
     lower bound.
     """
     body, handle = part_distances(obj, points)
@@ -183,7 +183,7 @@ def signed_distance(obj: TabletopObject, points: Float[Array, "... 3"]) -> Float
 
 
 def colour(obj: TabletopObject, points: Float[Array, "... 3"], normals: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-    """Lit colour in [0, 1] of surface points with unit normals: Lambert plus ambient, the light fixed to the object."""
+    """Lit colour in [0, 1] of surface points with unit normals: Lambert plus ambient; the light is fixed to it."""
     x, y, z = to_canonical(obj, points)
     body, handle = canonical_distances(obj, x, y, z)
     return canonical_colour(obj, (x, y, z), normals, handle < body)
@@ -248,9 +248,9 @@ def sample_objects(seeds: Sequence[int], slack: float = 1.0) -> TabletopObject:
 
 
 def description(obj: TabletopObject) -> Float[Array, "p"]:
-    """Everything that shape and looks depend on, as one vector of numbers of order 1: what training is told of it.
+    """All parameters of shape and appearance, as one vector of numbers of order 1: the input of `Recognition`.
 
-    Angles are told as cosine and sine, and a pattern that is not painted as zeros.
+    Angles are given as cosine and sine. A pattern that is not used is given as zeros.
     """
     patterned = (obj.texture == LABELLED) | (obj.texture == PRINTED)
     per_height, phase, threshold = obj.bands

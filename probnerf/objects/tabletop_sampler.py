@@ -1,4 +1,4 @@
-"""Random shapes and looks of tabletop objects, as plain arrays: the fields of `tabletop.TabletopObject`.
+"""Random shapes and appearances of tabletop objects, as plain arrays: the fields of `tabletop.TabletopObject`.
 
 Lengths are canonical cube units, angles radians; s in [0, 1] is the height as a fraction of the body's.
 """
@@ -14,14 +14,14 @@ CAN, CUP, MUG, BOWL, BOTTLE, PITCHER, CARTON = range(7)
 TEXTURES = ("plain", "banded", "labelled", "printed")
 PLAIN, BANDED, LABELLED, PRINTED = range(4)
 
-REACH_LIMIT = 0.95  # no part's |x| exceeds this before slack, so that the cube holds it after
+REACH_LIMIT = 0.95  # limit of every part's |x| before slack, so that it stays in the cube after it
 SLACK_LOG_SCALE = 0.05  # standard deviations of the placement in the cube
 SLACK_SHIFT = 0.03
 
 _KIND_WEIGHTS = (0.14, 0.12, 0.24, 0.10, 0.12, 0.14, 0.14)
 _TEXTURE_WEIGHTS = (0.35, 0.20, 0.25, 0.20)
 OUTER_VERTICES, _INNER, _TUBE = 10, 5, 9  # vertices of the outer and inner profile, and of the handle's centre line
-ABSENT = -8.0  # the radius of a part that is not there: its distance is then at least 8
+ABSENT = -8.0  # radius of an absent part: its distance is then at least 8
 
 
 def _profile(rng: np.random.Generator, kind: int) -> tuple[np.ndarray, np.ndarray]:
@@ -108,7 +108,7 @@ def _handle(
     line_z = np.clip(line_z, z[0] + tube + 0.01, z[-1] + 0.12)
     along = np.linspace(0.0, 1.0, _TUBE)
     wall_x = np.maximum((1 - along) * ends[0] + along * ends[1], np.interp(line_z, z, radius))
-    # The ends' balls meet the wall without showing in the cavity.
+    # The balls at the ends reach the wall, but not the cavity.
     line_x = wall_x + max(tube - wall, 0.0) + 0.01 + (reach - tube) * out / out.max()
     line_x = np.minimum(line_x, REACH_LIMIT - tube)
     return np.stack([line_x, line_z], axis=-1), tube, across
@@ -172,11 +172,11 @@ def _vessel(rng: np.random.Generator, kind: int) -> dict[str, np.ndarray | float
     is_closed = kind in (CAN, BOTTLE) or rng.uniform() < {MUG: 0.08, PITCHER: 0.45}.get(kind, 0.0)
     wall = rng.uniform(0.07, 0.13)
     chamfer = rng.uniform(0.008, 0.03)
-    # Chamfers keep the largest radius and both end planes; a vertex next to the end moves along the profile.
+    # Chamfers keep the largest radius and both end planes; the vertices next to the ends move along the profile.
     outer_z = np.concatenate([[z[0], z[0] + chamfer], z[1:-1], [z[-1] - chamfer, z[-1]]])
     outer_r = np.interp(outer_z, z, radius)
     outer_r[[0, -1]] -= chamfer
-    outer_r *= radius.max() / outer_r.max()  # a chamfer may have cut the widest vertex
+    outer_r *= radius.max() / outer_r.max()  # a chamfer may have reduced the largest radius
     outline = np.tile([0.0, z[-1]], (17, 1))
     outline[0] = 0.0, z[0]
     outline[1 : 1 + OUTER_VERTICES] = np.stack([outer_r, outer_z], axis=-1)
@@ -214,7 +214,7 @@ def _carton(rng: np.random.Generator) -> dict[str, np.ndarray | float]:
     lying = rng.uniform() < 0.3
     depth, width, height = (sides[1], sides[2], sides[0]) if lying else (sides[0], sides[1], sides[2])
     if not lying and rng.uniform() < 0.25:
-        width, height = height, width  # on its long narrow side
+        width, height = height, width  # it stands on its long narrow side
     half = 0.5 * BODY_EXTENT * np.array([depth, width, height])
     rounding = min(rng.uniform(0.005, 0.06), 0.4 * half.min())
     return {
@@ -242,7 +242,7 @@ def draw(seed: int, slack: float) -> dict[str, np.ndarray | float]:
         spout = np.asarray(shape["spout"])
         lower = np.minimum(lower, [(spout[:, 0] - spout[:, 2]).min(), -spout[:, 2].max(), BASE_Z])
         upper = np.maximum(upper, [0.0, 0.0, (spout[:, 1] + spout[:, 2]).max()])
-    while True:  # the part of the slack that stays well inside the box that rays are traced in
+    while True:  # reject slack that puts the object near the border of the ray tracer's box
         scale = np.exp(slack * SLACK_LOG_SCALE * rng.standard_normal())
         shift = slack * SLACK_SHIFT * rng.standard_normal(2)
         if max(np.abs(scale * lower[:2] + shift).max(), np.abs(scale * upper[:2] + shift).max()) <= 1.2:

@@ -1,4 +1,4 @@
-"""Batches of training's second phase: which objects, views and pixels a step sees, a function of (seed, step) alone."""
+"""Batches of the ray phase: each step's objects, views and pixels. They depend only on (seed, step)."""
 
 from typing import Protocol
 
@@ -11,7 +11,7 @@ from probnerf.training.pictures import ViewSet
 
 
 class BatchConfig(Protocol):
-    """What of the recipe a batch depends on (see TrainConfig)."""
+    """The part of the recipe that batches depend on (see TrainConfig)."""
 
     @property
     def seed(self) -> int: ...
@@ -41,13 +41,13 @@ class Batch(eqx.Module):
     origin: Data  # f32 [b, n, 3]
     direction: Data  # f32 [b, n, 3]
     ray_rgb: Data  # f32 [b, n, 3]
-    ray_range: Data  # f32 [b, n], 0 on a miss, negative on the object where it is unknown
-    ray_weight: Data  # f32 [b, n], sums to about 1: the unbiased mean over all pixels of all views
-    turn: Data  # f32 [b, 4] yaw, x, y, log-scale of the object over the standing lattice
+    ray_range: Data  # f32 [b, n], 0 for a miss, negative for an object pixel of unknown range
+    ray_weight: Data  # f32 [b, n], sums to about 1; gives an unbiased mean over all pixels of all views
+    turn: Data  # f32 [b, 4] yaw, x, y, log-scale of the object relative to the fixed lattice
 
 
 class Strata(eqx.Module):
-    """Per object: pixel indices (into views x pixels) sorted by stratum, and where each stratum ends."""
+    """Per object: pixel indices (into views x pixels) sorted by stratum, and the end of each stratum."""
 
     order: np.ndarray  # i32 [N, V S S]
     object_end: np.ndarray  # i32 [N]
@@ -57,7 +57,7 @@ class Strata(eqx.Module):
 def strata_of(views: ViewSet) -> Strata:
     """Sort every object's pixels into object, near and far."""
     n = len(views.seeds)
-    mask = views.range != 0  # negative: an object pixel without a range
+    mask = views.range != 0  # negative: an object pixel of unknown range
     near = ndimage.binary_dilation(mask, np.ones((1, 1, 5, 5), bool))
     stratum = np.where(mask, 0, np.where(near, 1, 2)).astype(np.uint8).reshape(n, -1)
     order = np.argsort(stratum, axis=1, kind="stable").astype(np.int32)
@@ -65,7 +65,7 @@ def strata_of(views: ViewSet) -> Strata:
 
 
 def draw_batch(views: ViewSet, strata: Strata, config: BatchConfig, step: int, size: int) -> Batch:
-    """The batch of one step: a function of (seed, step) alone, so that a resumed run repeats the lost one."""
+    """The batch of one step. It depends only on (seed, step), so a resumed run repeats the same batches."""
     rng = np.random.default_rng([config.seed, step, 3])
     chosen = rng.choice(len(views.seeds), size, replace=len(views.seeds) < size)
     j, s = config.views, views.size
@@ -124,7 +124,7 @@ def draw_batch(views: ViewSet, strata: Strata, config: BatchConfig, step: int, s
 
 
 def _half_planes(rng: np.random.Generator, b: int, j: int, s: int) -> np.ndarray:
-    """Random occluders for the encoder: a quarter of the views lose a half plane."""
+    """Random occluders for the encoder: a half plane is hidden in a quarter of the views."""
     y, x = np.mgrid[:s, :s] / s - 0.5
     angle = rng.uniform(0, 2 * np.pi, (b, j, 1, 1))
     offset = rng.uniform(-0.2, 0.35, (b, j, 1, 1))

@@ -1,16 +1,16 @@
 """ELBO training of a prior (paper §2.2): procedural objects in, ProbNeRF weights out. Two phases.
 
-Solid phase: what is solid and what colour surfaces have (`solids`), observed at points. It needs no picture and costs
-a tenth of rays; it makes the decoder. Ray phase: pixels of views as well, through the same joint pixel likelihood that
-inference uses, on a lattice that is turned, shifted and scaled at random; and the picture encoder. All are
-observations, the objective is an ELBO throughout: N_points E[log p] + N_colours E[log p] + N_rays E[log p] - weight KL.
-Pixels are drawn by strata (object, near it, elsewhere) and weighted by each stratum's size, so that the pixel term is
-an unbiased estimate of its mean over all pixels.
+Solid phase: the data are occupancy and surface colour at points (`solids`). It needs no pictures and costs a tenth of
+the ray phase. It trains the decoder. Ray phase: the data also include pixels of views. Their likelihood is the joint
+pixel likelihood of inference, on a lattice that is rotated, shifted and scaled at random. This phase also trains the
+picture encoder. The objective is an ELBO in both phases: N_points E[log p] + N_colours E[log p] + N_rays E[log p] -
+weight KL. Pixels are drawn by strata (object, near it, elsewhere) and weighted by each stratum's size. So the pixel
+term is an unbiased estimate of its mean over all pixels.
 
-Unlike the paper's, q(z) is not read off pictures: `Recognition` is told the object's exact description, and the decoder
-learns several times faster. The picture encoder learns to cover the recognised z (forward KL), so that what a view
-leaves open stays open in its answer. With pictures alone (`solids` is None) it is the paper's way: every step is one of
-rays, with q(z) from the picture encoder.
+In the paper, q(z) comes from pictures. Here it comes from `Recognition`, whose input is the object's exact description,
+and the decoder learns several times faster. The picture encoder learns to cover the recognised z (forward KL), so its
+density stays wide where a view is ambiguous. Without `solids` (None), training follows the paper: every step uses rays,
+and q(z) comes from the picture encoder.
 """
 
 import json
@@ -62,18 +62,18 @@ def kl_estimate(model: ProbNeRF, z: Array, mean: Array, precision: Array) -> Flo
 
 
 def encoder_loss(model: ProbNeRF, batch: Batch, z: Float[Array, "b k"]) -> Float[Array, ""]:
-    """-log q(z | views) of the recognised z: the encoder learns to cover what views leave open, not to pick a mode."""
+    """-log q(z | views) at the recognised z. So the encoder learns to cover all shapes that fit, not to pick a mode."""
     mean, precision = encode(model, batch)
     z = jax.lax.stop_gradient(z)
     return -0.5 * jnp.mean(jnp.sum(jnp.log(precision) - precision * (z - mean) ** 2, axis=-1))
 
 
 def _solid_terms(shared: tuple, item: tuple, weights: Array) -> Float[Array, ""]:
-    """Mean log-likelihood of solid samples and of surface colours, each times its count."""
+    """Mean log-likelihoods of solid samples and of surface colours, each times its effective count."""
     field, likelihood, config = shared
     points, inside, place, view, rgb, valid = item
     tau = field.density(weights, points) * foam.window(points) / likelihood.lattice.cubes
-    # a grazing ray meets several faces outside, a finer lattice has thinner ones inside: both sharpen the wall
+    # a grazing ray crosses more faces outside, a finer lattice has thinner ones inside: both make walls sharper
     probability = jnp.where(inside, -jnp.expm1(-tau / config.finer), jnp.exp(-config.grazing * tau))
     eps = likelihood.mask_error
     solid = jnp.mean(jnp.log(eps + (1.0 - 2.0 * eps) * probability))
@@ -96,9 +96,9 @@ class _ObjectRays(eqx.Module):
 
 
 def _ray_terms(shared: tuple, item: tuple[_ObjectRays, tuple | None], weights: Array) -> Float[Array, ""]:
-    """Weighted mean of the joint pixel log-likelihood over a lattice that is turned, shifted and scaled; and solids.
+    """Weighted mean of the joint pixel log-likelihood on a rotated, shifted and scaled lattice, plus the solid terms.
 
-    The first rays are the object's; one whose range is negative has none, and says only that it hits, and its colour.
+    The object's rays come first. A negative range is unknown: such a ray informs only about its hit and colour.
     """
     field, likelihood, config = shared
     seen, solids = item
@@ -144,9 +144,10 @@ def loss(
     likelihood: Likelihood,
     config: TrainConfig,
 ) -> tuple[Array, dict[str, Array]]:
-    """Negative ELBO per object, with q(z) by recognition; with `batch`, rays and the encoder's loss too. And parts.
+    """Negative ELBO per object, with q(z) from recognition, and its parts.
 
-    Without `solids`, q(z) is the encoder's, and rays are all that there is.
+    With `batch`, it includes rays and the encoder's loss. Without `solids`, q(z) comes from the encoder, and only rays
+    are used.
     """
     model, recognition = networks
     k0, k1, k2 = jax.random.split(key, 3)
@@ -173,7 +174,7 @@ def loss(
 
 @dataclass(frozen=True)
 class _Bound:
-    """A function with its constants: hashable, as a static argument must be."""
+    """A function with bound constants. It is hashable, so it can be a static argument."""
 
     terms: Callable
     constants: tuple
@@ -183,7 +184,7 @@ class _Bound:
 
 
 class TrainState(eqx.Module):
-    """Everything that a resumed run needs; batches and keys are functions of the step."""
+    """All state that a resumed run needs. Batches and keys depend only on the step and the seed."""
 
     model: ProbNeRF
     recognition: Recognition
@@ -192,7 +193,7 @@ class TrainState(eqx.Module):
 
 
 def optimiser_of(config: TrainConfig) -> optax.GradientTransformation:
-    """Adam (paper §2.2) with clipping against the rare bad batch; warm-up and cosine decay in each phase."""
+    """Adam (paper §2.2) with gradient clipping against rare bad batches, and warm-up and cosine decay in each phase."""
 
     def schedule(solid: float, ray: float, frozen: int = 0) -> optax.Schedule:
         first = min(config.solid_steps, config.steps)
@@ -216,13 +217,13 @@ def optimiser_of(config: TrainConfig) -> optax.GradientTransformation:
     rates = {
         "decoder": optax.adam(schedule(config.learning_rate, config.ray_learning_rate, config.frozen_steps)),
         "recognition": optax.adam(schedule(config.learning_rate, config.ray_learning_rate)),
-        "encoder": optax.adam(schedule(config.learning_rate, config.learning_rate)),  # idle in the solid phase
+        "encoder": optax.adam(schedule(config.learning_rate, config.learning_rate)),  # unused in the solid phase
     }
     return optax.chain(optax.clip_by_global_norm(200.0), optax.multi_transform(rates, labels))
 
 
 def initial_state(model: ProbNeRF, config: TrainConfig) -> TrainState:
-    """A fresh run."""
+    """The state of a new run."""
     size = description(sample_object(0)).shape[0]
     key = jax.random.fold_in(jax.random.key(config.seed), 1)
     recognition = Recognition(size, model.latent, model.preset.hyper_hidden, key)
@@ -234,7 +235,7 @@ def initial_state(model: ProbNeRF, config: TrainConfig) -> TrainState:
 def train_step(
     static: tuple[Likelihood, TrainConfig], state: TrainState, solids: Solids | None, batch: Batch | None
 ) -> tuple[TrainState, dict[str, Array]]:
-    """One update: of the solid phase without `batch`."""
+    """One update. Without `batch`, it is a step of the solid phase."""
     likelihood, config = static
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
     kl_weight = jnp.clip(state.step / config.kl_warmup, 0.02, 1.0)
@@ -247,7 +248,7 @@ def train_step(
 
 
 def save_checkpoint(path: Path, state: TrainState) -> None:
-    """Atomic: a killed run leaves the old checkpoint or the new one, never half of one."""
+    """Write the checkpoint atomically: a killed run leaves the old file or the new one."""
     with whole_file(path) as part, part.open("wb") as file:
         eqx.tree_serialise_leaves(file, state)
         file.flush()
@@ -259,8 +260,8 @@ def train(
 ) -> Iterator[tuple[TrainState, dict[str, float]]]:
     """Run or resume in `folder`; yields (state, metrics) every `log_every` steps and appends them to history.jsonl.
 
-    `views` are pictures of the first so many objects of `solids`; None trains on pictures alone, with no solid phase.
-    Raises FloatingPointError on a non-finite loss, naming the step; the last checkpoint stays.
+    `views` are pictures of the first objects of `solids`. If `solids` is None, there is no solid phase, and training
+    uses only pictures. Raises FloatingPointError with the step if the loss is not finite. The last checkpoint is kept.
     """
     if solids is None and config.solid_steps:
         raise ValueError(f"solid_steps is {config.solid_steps}; it must be 0 where there are pictures alone")
@@ -268,7 +269,7 @@ def train(
         raise ValueError(f"--views is {config.views} but objects have {views.rgb.shape[1]} pictures; give no more")
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint, history = folder / "checkpoint.eqx", folder / "history.jsonl"
-    state = initial_state(jax.tree.map(jnp.copy, model), config)  # its own buffers: a step gives its inputs away
+    state = initial_state(jax.tree.map(jnp.copy, model), config)  # a copy, because a step donates its input buffers
     settings = folder / "config.json"
     described = json.dumps(asdict(config), indent=1)
     if checkpoint.exists():

@@ -1,6 +1,6 @@
 """Training views: pictures of procedural objects from random cameras, drawn once and kept in memory.
 
-A view camera looks roughly at the cube's centre, as the crop that `perception` makes of a real frame does.
+Each camera looks approximately at the cube's centre, as does the crop that `perception` makes of a real frame.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from probnerf.prior.encoder_input import ENCODER_RADIUS
 
 @dataclass(frozen=True)
 class ViewSet:
-    """Pictures of N objects, V views each, S pixels a side; range 0 marks a miss, below 0 a hit of unknown range."""
+    """Pictures of N objects, V views each, S x S pixels. Range: 0 for a miss, below 0 if unknown."""
 
     seeds: np.ndarray  # [N]
     rgb: np.ndarray  # u8 [N, V, S, S, 3]
@@ -31,7 +31,7 @@ class ViewSet:
 
 
 def random_camera(rng: np.random.Generator) -> tuple[np.ndarray, float]:
-    """T_object_camera and tangent of its half field of view: 5 to 75 degrees above the table, 3 to 10 units away."""
+    """T_object_camera and the tangent of the half field of view. Elevation 5 to 75 degrees, distance 3 to 10 units."""
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(5, 75))
     distance = rng.uniform(3.0, 10.0)
     position = distance * np.array(
@@ -45,7 +45,7 @@ def random_camera(rng: np.random.Generator) -> tuple[np.ndarray, float]:
 def draw_views(
     seeds: np.ndarray, views: int, size: int, slack: float = 1.0, progress: Callable[[int, int], None] | None = None
 ) -> ViewSet:
-    """Render `views` random pictures of each object; the cameras are a function of the object's seed."""
+    """Render `views` random pictures of each object. The cameras depend only on the object's seed."""
     rgb = np.zeros((len(seeds), views, size, size, 3), np.uint8)
     ranges = np.zeros((len(seeds), views, size, size), np.float32)
     transforms = np.zeros((len(seeds), views, 4, 4), np.float32)

@@ -1,12 +1,13 @@
 """Posed pictures of many objects in the layout of Scene Representation Networks (Sitzmann et al. 2019).
 
     DIR/NAME/intrinsics.txt   `f cx cy 0` (px), barycentre, scale, `height width`; a fifth line 1: poses are inverted
-    DIR/NAME/rgb/000000.png   RGBA, where alpha marks the object, or RGB, where all that is not white is the object
+    DIR/NAME/rgb/000000.png   RGBA, where alpha marks the object, or RGB, where pixels that are not white are the object
     DIR/NAME/pose/000000.txt  16 numbers: T_world_camera, OpenCV axes (x right, y down, z forward)
 
-Into the unit cube: p_cube = 2 (p_world - barycentre) / scale, z up: the scale is the cube's side. SRN's own files say
-0 and 1, so that the ball of radius 0.5 which its objects fill becomes the unit ball. To stand as the tabletop family
-does, an object's base is 0.375 scale below the barycentre and its largest side 0.7 scale. Pixel centres lie at +0.5.
+Transform to the unit cube: p_cube = 2 (p_world - barycentre) / scale, z up. So the scale is the cube's side. SRN's own
+files have barycentre 0 and scale 1: their objects fill a ball of radius 0.5, which becomes the unit ball. To match the
+tabletop family, put an object's base 0.375 scale below the barycentre and make its largest side 0.7 scale. Pixel
+centres are at +0.5.
 """
 
 from collections.abc import Callable
@@ -23,22 +24,22 @@ from probnerf.prior.encoder_input import ENCODER_RADIUS
 from probnerf.training.pictures import ViewSet
 
 NO_RANGE = -1.0  # in a ViewSet: an object pixel whose distance is unknown
-_WHITE = 250  # a pixel without alpha whose samples are all at least this is background
+_WHITE = 250  # without alpha, a pixel is background if all its samples are at least this
 _PNG_END = b"IEND\xaeB`\x82"
-_MOST_SAMPLES = 8  # per pixel and axis, when pictures become smaller
+_MOST_SAMPLES = 8  # per pixel and axis, when a picture is reduced
 _LINES = ("f cx cy 0", "barycentre", "scale", "height width")
 
 
 @dataclass(frozen=True, eq=False)
 class Instance:
-    """One object's pictures, V of H x W pixels, as the files have them. Raises ValueError if they cannot be."""
+    """One object's V pictures of H x W pixels, as in the files. Raises ValueError if a value is invalid."""
 
     name: str
     focal: float  # px
     centre: tuple[float, float]  # cx, cy; px
     barycentre: tuple[float, float, float]  # world units
     scale: float  # world units: the cube's side
-    rgb: UInt8[np.ndarray, "v h w 3"]  # made white where there is no object
+    rgb: UInt8[np.ndarray, "v h w 3"]  # set to white outside the object
     mask: Bool[np.ndarray, "v h w"]
     T_world_camera: Float[np.ndarray, "v 4 4"]
 
@@ -80,7 +81,7 @@ def write_view(
     mask: Bool[np.ndarray, "h w"],
     T_world_camera: Float[np.ndarray, "4 4"],
 ) -> None:
-    """One picture and, last, its pose: a view whose pose is there is complete."""
+    """Write one picture, then its pose. So a view is complete if its pose exists."""
     for name in ("rgb", "pose"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     white = np.where(mask[..., None], rgb, np.uint8(255))
@@ -91,7 +92,7 @@ def write_view(
 
 
 def write_instance(root: Path, instance: Instance) -> Path:
-    """One instance under `root`; gives its folder. Reading it gives the same numbers, bit by bit."""
+    """Write one instance under `root` and return its folder. Reading it gives bit-identical numbers."""
     folder, size = root / instance.name, instance.mask.shape[1:]
     write_intrinsics(folder, instance.focal, instance.centre, instance.barycentre, instance.scale, (size[0], size[1]))
     for index, view in enumerate(zip(instance.rgb, instance.mask, instance.T_world_camera, strict=True)):
@@ -115,7 +116,7 @@ def find_instances(root: Path) -> list[Path]:
 
 
 def read_instance(folder: Path) -> Instance:
-    """All views of one instance. Raises FileNotFoundError or ValueError naming the file (and line) and the remedy."""
+    """All views of one instance. Raises FileNotFoundError or ValueError with the file (and line) and a remedy."""
     focal, centre, barycentre, scale, size, inverted = _read_intrinsics(folder / "intrinsics.txt")
     pictures = {path.stem for path in (folder / "rgb").glob("*.png")}
     poses = {path.stem for path in (folder / "pose").glob("*.txt")}
@@ -139,11 +140,11 @@ def read_instance(folder: Path) -> Instance:
 def read_views(
     root: Path, size: int, pictures: int | None = None, progress: Callable[[int, int], None] | None = None
 ) -> ViewSet:
-    """Every instance in `root` as training takes it: `pictures` of each (None: all), `size` pixels a side.
+    """Every instance in `root` in the form that training needs: `pictures` of each (None: all), `size` pixels a side.
 
-    Where an instance has more, they are spread evenly; where it has fewer, some come twice. A picture that is not of
-    this size, with the axis in its middle, is seen anew by a camera at the same place that looks at the cube's centre.
-    Object pixels have range NO_RANGE. Raises as `read_instance` does.
+    If an instance has more pictures, they are spread evenly. If it has fewer, some repeat. A picture of another size,
+    or with an off-centre principal point, is warped to a camera at the same position that looks at the cube's centre.
+    Object pixels have range NO_RANGE. Raises the same errors as `read_instance`.
     """
     folders = find_instances(root)
     if pictures is not None and pictures < 1:
@@ -171,7 +172,7 @@ def read_views(
 
 
 def _square(instance: Instance, view: int, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """rgb, mask, T_cube_camera and tangent of the half field of one view at `size` pixels a side."""
+    """rgb, mask, T_cube_camera and tangent of the half field of view of one view, at `size` pixels a side."""
     rgb, mask, T = instance.rgb[view], instance.mask[view], instance.T_cube_camera[view]
     if mask.shape == (size, size) and instance.centre == (0.5 * size, 0.5 * size):
         return rgb, mask, T, 0.5 * size / instance.focal
@@ -190,7 +191,7 @@ def _square(instance: Instance, view: int, size: int) -> tuple[np.ndarray, np.nd
     )
     K_new = np.array([[0.5 * n / tangent, 0, 0.5 * n - 0.5], [0, 0.5 * n / tangent, 0.5 * n - 0.5], [0, 0, 1]])
     source_of_new = K @ T[:3, :3].T @ T_new[:3, :3] @ np.linalg.inv(K_new)
-    shown = np.dstack([np.where(mask[..., None], rgb, 0), mask]).astype(np.float32)  # so that no white bleeds in
+    shown = np.dstack([np.where(mask[..., None], rgb, 0), mask]).astype(np.float32)  # black, so that no white bleeds in
     warped = cv2.warpPerspective(shown, source_of_new, (n, n), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     mean = warped.reshape(size, finer, size, finer, 4).mean(axis=(1, 3))
     inside: np.ndarray = mean[..., 3] >= 0.5
@@ -240,7 +241,7 @@ def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
 
 def _read_picture(path: Path, size: tuple[int, int]) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     data = path.read_bytes()
-    if not data.endswith(_PNG_END):  # OpenCV would fill what is missing with zeros
+    if not data.endswith(_PNG_END):  # OpenCV would fill missing rows with zeros
         raise ValueError(f"{path} is cut short, or no PNG; copy it again")
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
@@ -252,7 +253,7 @@ def _read_picture(path: Path, size: tuple[int, int]) -> tuple[UInt8[np.ndarray, 
             f"{path} is {image.shape[1]}x{image.shape[0]} px but intrinsics.txt says {size[1]}x{size[0]}; correct one"
         )
     rgb = np.ascontiguousarray(image[..., 2::-1])
-    if image.shape[2] == 4 and image[..., 3].min() < 255:  # an alpha that is opaque everywhere marks nothing
+    if image.shape[2] == 4 and image[..., 3].min() < 255:  # an alpha channel that is opaque everywhere marks no object
         return rgb, image[..., 3] >= 128
     return rgb, np.asarray((rgb < _WHITE).any(axis=-1))
 

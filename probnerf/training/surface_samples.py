@@ -1,6 +1,7 @@
-"""Solid samples: points in and around procedural objects, with what is true of them. What a decoder learns first from.
+"""Solid samples: points in and around procedural objects, with their true occupancy and colour.
 
-They cost a hundredth of a picture's rays, need no picture, and tell of every side at once.
+The decoder learns from them first. They cost about a hundredth of a picture's rays, need no picture, and cover all
+sides of an object.
 """
 
 from collections.abc import Callable
@@ -15,28 +16,28 @@ from probnerf.objects.tabletop import TabletopObject, colour, sample_objects, si
 from probnerf.types import BASE_Z
 
 PER_OBJECT = 256  # surface points kept of each object
-_HANDLE_SHARE = 4  # one in so many of them is drawn around the handle: it is a hundredth of the cube
-_NEAR = (0.008, 0.12)  # cube units: samples lie off the surface by normal steps of log-uniform size
-_BEHIND = 0.04  # a lattice of 32 meets a surface up to so far behind it: colours are asked for there
+_HANDLE_SHARE = 4  # one in this many is drawn around the handle, which fills a hundredth of the cube
+_NEAR = (0.008, 0.12)  # cube units; range of the log-uniform scale of the samples' normal offsets from the surface
+_BEHIND = 0.04  # cube units; a lattice of 32 can have a face this far behind a surface, so it needs colours there
 
 Data = Array | np.ndarray
 
 
 class Solids(eqx.Module):
-    """Objects with points of their surfaces, hidden sides included; every array has a leading object axis."""
+    """Objects with points on their surfaces, including hidden sides. All arrays have a leading object axis."""
 
     objects: TabletopObject
     point: Data  # f32 [n, k, 3], cube units
     normal: Data  # f32 [n, k, 3]
     rgb: Data  # f32 [n, k, 3], lit colour in [0, 1]
-    valid: Data  # bool [n, k]: the search for a surface point ended on one
+    valid: Data  # bool [n, k]: the search converged to the surface
 
     def __getitem__(self, rows: np.ndarray | slice) -> "Solids":
         return jax.tree.map(lambda a: a[rows], self)
 
 
 def draw_solids(seeds: np.ndarray, progress: Callable[[int, int], None] | None = None) -> Solids:
-    """Surface points of the objects of `seeds`: a function of each seed alone."""
+    """Surface points of the objects of `seeds`. They depend only on each seed."""
     parts, block = [], 512
     for start in range(0, len(seeds), block):
         chosen = seeds[start : start + block]
@@ -60,7 +61,7 @@ def _surface(objects: TabletopObject, seeds: Array) -> Solids:
         handle = PER_OBJECT // _HANDLE_SHARE
         around = (_handle_points(obj, k1, handle) - base) * obj.scale + shift
         point = start.at[:handle].set(jnp.where(obj.has_handle, around, start[:handle]))
-        for _ in range(4):  # down the distance to the surface; four steps settle all but where parts overlap
+        for _ in range(4):  # descend to the surface; four steps suffice except where parts overlap
             point = point - signed_distance(obj, point)[:, None] * _normal(obj, point)
         normal = _normal(obj, point)
         rgb = colour(obj, point, normal)
@@ -73,7 +74,7 @@ def _surface(objects: TabletopObject, seeds: Array) -> Solids:
 
 
 def _handle_points(obj: TabletopObject, key: PRNGKeyArray, count: int) -> Float[Array, "n 3"]:
-    """Canonical points about 0.1 from the handle's centre line, which lies in the plane y = 0."""
+    """Canonical points within about 0.1 of the handle's centre line, which lies in the plane y = 0."""
     k0, k1 = jax.random.split(key)
     last = obj.tube.shape[0] - 1
     u = last * jax.random.uniform(k0, (count,))
@@ -84,7 +85,7 @@ def _handle_points(obj: TabletopObject, key: PRNGKeyArray, count: int) -> Float[
 
 
 def _normal(obj: TabletopObject, points: Float[Array, "n 3"], step: float = 2e-3) -> Float[Array, "n 3"]:
-    """Direction of steepest distance, by central differences: on the surface itself a square root has no gradient."""
+    """Normalised gradient of the signed distance. By differences, since its square roots have none on the surface."""
     ahead, behind = (
         jnp.stack([signed_distance(obj, points + sign * step * axis) for axis in jnp.eye(3)], axis=-1)
         for sign in (1.0, -1.0)
@@ -101,7 +102,7 @@ def _pick(a: Data, index: Array) -> Array:
 
 
 def shape_samples(batch: Solids, key: PRNGKeyArray, count: int) -> tuple[Float[Array, "b n 3"], Bool[Array, "b n"]]:
-    """Points, three quarters of them near the surface and the rest anywhere in the cube, and whether each is inside."""
+    """Points, and whether each is inside. Three quarters are near the surface, the rest anywhere in the cube."""
     k0, k1, k2, k3 = jax.random.split(key, 4)
     b, near = batch.point.shape[0], 3 * count // 4
     index = jax.random.randint(k0, (b, near), 0, batch.point.shape[1])
@@ -115,7 +116,7 @@ def shape_samples(batch: Solids, key: PRNGKeyArray, count: int) -> tuple[Float[A
 def colour_samples(
     batch: Solids, key: PRNGKeyArray, count: int
 ) -> tuple[Float[Array, "b n 3"], Float[Array, "b n 3"], Float[Array, "b n 3"], Bool[Array, "b n"]]:
-    """Points a little behind the surface, directions that a camera may look in, their colours, and which count."""
+    """Points slightly behind the surface, possible viewing directions, colours, and which samples are valid."""
     k0, k1, k2 = jax.random.split(key, 3)
     index = jax.random.randint(k0, (batch.point.shape[0], count), 0, batch.point.shape[1])
     normal = _pick(batch.normal, index)
