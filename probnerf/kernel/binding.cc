@@ -1,4 +1,4 @@
-// The XLA FFI handler: checks shapes, chooses the instruction set of this machine, shares work out over threads.
+// The XLA FFI handler. It checks shapes, selects the instruction set and distributes work over threads.
 #include <algorithm>
 #include <atomic>
 #include <cstdlib>
@@ -37,7 +37,7 @@ FARSIDE_DECLARE(avx2)
 FARSIDE_DECLARE(avx512)
 #endif
 
-// The widest that this machine has, or the one asked for; null where it has no such one.
+// The widest instruction set of this machine, or the requested one; null if it is not available.
 static const Code* code(std::string_view asked) {
   static const std::vector<Code> have = [] {
     std::vector<Code> all;
@@ -55,8 +55,8 @@ static const Code* code(std::string_view asked) {
   return nullptr;
 }
 
-// work(i, memory) for i < count, each on a thread of its own, or on this one where the system starts no more of them.
-// False where there was no memory of so many floats for one.
+// Runs work(i, memory) for i < count, each on its own thread, or on this thread if the system cannot start another.
+// Returns false if memory for that many floats could not be allocated.
 template <class Work>
 static bool on_threads(int count, int64_t floats, const Work& work) {
   std::atomic<bool> enough{true};
@@ -85,7 +85,7 @@ using F32Result = ffi::Result<F32>;
 
 static ffi::Error wrong(const std::string& what) { return ffi::Error::InvalidArgument(what); }
 
-// What is wrong with a field of these sizes and so many weights for each of so many poses; "" if nothing is.
+// The error for a field of these sizes with this many weights and poses, or "" if there is none.
 static std::string wrong_with(const FieldSizes& f, const F32& weights, const F32& pose) {
   if (weights.dimensions().size() != 2) return "weights must be a matrix";
   if (f.width < 1 || f.octaves < 0 || f.direction_octaves < 0) return "a field has a width, and no less than 0 octaves";
@@ -119,11 +119,11 @@ static ffi::Error view_terms(F32 weights, F32 pose, F32 origin, F32 direction, F
   View view{int(crossings[0]), int(crossings[1]), colour_count, origin.typed_data(), direction.typed_data(),
             t.typed_data(), rgb.typed_data(), range.typed_data(), range_sigma.typed_data(), limit.typed_data(),
             weight.typed_data(), status.typed_data(), rgb_valid.typed_data(), range_valid.typed_data()};
-  // a particle is one thread's own, and the answer does not depend on their number; only where there are too few are
-  // they worked on in parts, each with a sum of its own, so many that threads have equally many of them
+  // Each particle belongs to one thread, so the result does not depend on the number of threads. If there are too few
+  // particles, each is split into parts with separate sums, so that all threads get the same number of parts.
   int workers = std::max(threads, 1);
   int64_t parts = particles < workers ? workers / std::gcd<int64_t>(workers, particles) : 1;
-  bool gradients = g_pose->element_count() > 0;  // else only values are asked for
+  bool gradients = g_pose->element_count() > 0;  // else only values are computed
   if (gradients && (g_weights->element_count() != weights.element_count() || g_pose->element_count() != pose.element_count()))
     return wrong("gradients are of the weights' shape and of the poses', or empty");
   int64_t row = size + 7, items = particles * parts;

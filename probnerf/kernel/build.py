@@ -1,8 +1,8 @@
 """Compile the kernel with the machine's C++ compiler, once: `python -m probnerf.kernel.build`. Reports a missing
 compiler.
 
-The sources travel with the package. The library lies in the user's cache folder under a digest of its sources, options
-and versions, so that a checkout, an installed package and several versions can coexist.
+The package contains the sources. The library is stored in the user's cache folder, under a digest of its sources,
+options and versions. So a checkout, an installed package and several versions can coexist.
 """
 
 import fcntl
@@ -38,7 +38,7 @@ def compiler() -> str | None:
 
 @cache
 def library_path() -> Path:
-    """The place of the built library."""
+    """The path of the built library."""
     digest = hashlib.sha256(repr((OPTIONS, PLAIN, X86, jax.__version__, platform.machine())).encode())
     for path in sorted([*SOURCES.glob("*.cc"), *SOURCES.glob("*.h")]):
         digest.update(path.name.encode() + path.read_bytes())
@@ -59,7 +59,7 @@ def built_library() -> Path | None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.with_name("lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # two processes that start at once build it once
+            fcntl.flock(lock, fcntl.LOCK_EX)  # processes that start together build it only once
             if not path.is_file() and not failure.is_file():
                 print("farside: building the kernel, once; this takes some seconds", file=sys.stderr)
                 if complaint := _build(cxx, path):
@@ -70,7 +70,7 @@ def built_library() -> Path | None:
 
 
 def _build(cxx: str, path: Path) -> str:
-    """Write the library; the compiler's messages if it failed, else ""."""
+    """Write the library. Returns the compiler's messages if it failed, else ""."""
     sets = PLAIN | (X86 if platform.machine() in ("x86_64", "AMD64") else {})
     with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
         runs, objects = [], []
@@ -98,7 +98,7 @@ def _build(cxx: str, path: Path) -> str:
 
 
 def main() -> None:
-    """Build, and print the library's place or what is missing."""
+    """Build, and print the library's path or what is missing."""
     library_path().with_name("failed.txt").unlink(missing_ok=True)
     if built_library() is not None:
         return

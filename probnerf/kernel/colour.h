@@ -1,13 +1,13 @@
-// The colour network on a tile: inputs are the point's encoding, the ray's direction, and the logarithm of density.
+// The colour network on a tile. Its inputs are the point's encoding, the ray's direction and the logarithm of density.
 #pragma once
 
 #include "field.h"
 
 namespace FARSIDE_NAMESPACE {
 
-// What a ray's direction adds to the first layer, the same for all of its points.
+// A ray direction's contribution to the first layer. It is the same for all points of the ray.
 struct Direction {
-  float *d, *gd;                   // [3] in the object's frame
+  float *d, *gd;                   // [3] in the object frame
   float *encoding, *before, *sum;  // [encoded_direction], [H], [H]: gradient summed over the ray's points
   static Direction take(const Sizes& s, Arena& a) {
     return {a.take(3), a.take(3), a.take(s.encoded_direction), a.take(s.H), a.take(s.H)};
@@ -59,7 +59,7 @@ inline void colour_forward(const Sizes& s, const Layers& w, const Direction* ray
   }
 }
 
-// From t.g_colour: adds to the weights' gradient, t.g_encoding, t.gx, t.g_sigma and the rays' sums.
+// Backward pass from t.g_colour. It adds to the weights' gradient, t.g_encoding, t.gx, t.g_sigma and the ray sums.
 inline void colour_backward(const Sizes& s, const Layers& w, const Transposed& wt, Direction* rays, Tile& t, Layers& g) {
   int n = t.padded;
   float* go[3] = {t.g_colour[0], t.g_colour[1], t.g_colour[2]};
@@ -89,7 +89,7 @@ inline void colour_backward(const Sizes& s, const Layers& w, const Transposed& w
   multiply(1, s.H, n, t.log_sigma, 0, 1, t.g0, s.H, g.k3s, s.H);
   for (int p = 0; p < t.count; ++p) add_rows(rays[t.ray[p]].sum, t.g0 + p * s.H, 1, s.H);
   multiply(n, s.E, s.width, t.g0, s.H, 1, wt.k3, s.E, t.g_encoding, s.E);
-  dot_rows(t.g0, n, s.H, w.k3s, t.log_sigma);  // its gradient, where it stood
+  dot_rows(t.g0, n, s.H, w.k3s, t.log_sigma);  // overwritten by its gradient
   for (int p = 0; p < n; p += LANES)
     store(t.g_sigma + p, load(t.g_sigma + p) + load(t.log_sigma + p) / (1.0f + load(t.sigma + p)));
 }

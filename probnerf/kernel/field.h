@@ -1,5 +1,5 @@
-// MLPField on a tile of points, forwards and backwards: the arithmetic of probnerf/fields/mlp.py. Hidden units and features
-// stand along the vectors' lanes ([point][unit]), except that encodings are computed for LANES points at a time.
+// MLPField on a tile of points, forward and backward: the arithmetic of probnerf/fields/mlp.py. Vector lanes hold
+// hidden units or features ([point][unit]). Only encodings are computed for LANES points at a time.
 #pragma once
 
 #include "problem.h"
@@ -16,8 +16,8 @@ struct Sizes {
   bool radial, fitted;
   float density_scale;
   int encoded, encoded_direction;  // features of a point and of a direction
-  int H, E;                        // units of a layer and features of a point in whole vectors
-  int tile;                               // points worked on together: they and their layers stay in the second cache
+  int H, E;                        // units of a layer and features of a point, rounded up to whole vectors
+  int tile;                               // points per tile: they and their layers fit in the L2 cache
   Sizes(const FieldSizes& f, int tile)
       : width(f.width), octaves(f.octaves), direction_octaves(f.direction_octaves), channels(3 + f.radial),
         radial(f.radial), fitted(f.fitted), density_scale(f.density_scale), tile(tile) {
@@ -28,7 +28,7 @@ struct Sizes {
   }
 };
 
-// Hands out parts of one block of memory, each at a multiple of 64 bytes; with none it only counts.
+// Allocates from one block of memory, at multiples of 64 bytes. Without a block, it only counts the size needed.
 struct Arena {
   float* next;
   int64_t used = 0;
@@ -41,7 +41,7 @@ struct Arena {
   }
 };
 
-// One object's weights, or their gradient, with rows of whole vectors.
+// One object's weights, or their gradient. Rows are padded to whole vectors.
 struct Layers {
   float *k0, *b0, *k1, *b1, *k2, *b2;                     // density: [encoded][H], [H], [width][H], [H], [H], [1]
   float *k3, *k3d, *k3s, *b3, *k4, *b4, *k5, *b5;         // colour: k3's rows for point, direction, density; k5 [3][H]
@@ -107,20 +107,20 @@ struct Transposed {
   }
 };
 
-// Everything of one tile. Rows [.][tile] have a point per lane, rows [tile][.] a unit or feature per lane.
+// All data of one tile. Rows [.][tile] have a point per lane, rows [tile][.] a unit or feature per lane.
 struct Tile {
   int count, padded;                   // points; the next multiple of LANES
-  float *q[3], *gq[3];                 // points in the object's frame, and the gradient there
-  float *x, *gx;                       // [4][tile] where the field is evaluated: fitted, with the radius
+  float *q[3], *gq[3];                 // points in the object frame, and their gradient
+  float *x, *gx;                       // [4][tile] input points of the field: after the fit, with the radius
   float *encoding, *g_encoding;        // [encoded][tile], [tile][E]
   float *h0, *h1, *c0, *c1, *g0, *g1;  // [tile][H]
-  float *output, *mlp_sigma;           // density network's output and its density, before the window
-  float *window, *slope;               // window, and its derivative by ...
+  float *output, *mlp_sigma;           // the density network's output, and its density before the window
+  float *window, *slope;               // window, and its derivative with respect to ...
   int* axis;                           // ... this coordinate
   float *sigma, *g_sigma;              // density with the window
-  float* log_sigma;                    // log(1 + sigma), which colour sees
+  float* log_sigma;                    // log(1 + sigma), the colour network's input
   float *colour[3], *g_colour[3];
-  int* ray;                            // which of the tile's rays a point is on
+  int* ray;                            // index of each point's ray in the tile
   Tile(const Sizes& s, Arena& a) {
     for (int i = 0; i < 3; ++i) q[i] = a.take(s.tile), gq[i] = a.take(s.tile), colour[i] = a.take(s.tile), g_colour[i] = a.take(s.tile);
     x = a.take(CHANNELS * s.tile), gx = a.take(CHANNELS * s.tile);
@@ -131,7 +131,7 @@ struct Tile {
   }
 };
 
-// `count` points from p on of a tile whose density is known, as points from `to` on of another.
+// Copies `count` points, from p, of a tile with known densities to another tile, from `to`.
 inline void copy_points(const Sizes& s, const Tile& from, int p, int count, Tile& t, int to) {
   auto copy = [&](const float* a, float* b) {
     for (int i = 0; i < count; ++i) b[to + i] = a[p + i];
@@ -146,7 +146,7 @@ inline void copy_points(const Sizes& s, const Tile& from, int p, int count, Tile
   for (int i = 0; i < count; ++i) t.axis[to + i] = from.axis[p + i];
 }
 
-// Points that fill the last vector and count for nothing.
+// Padding points that fill the last vector. They do not contribute.
 inline void pad(const Sizes& s, Tile& t) {
   t.padded = up(t.count, LANES);
   for (int p = t.count; p < t.padded; ++p) {
@@ -223,7 +223,7 @@ inline void encode(const Sizes& s, const float* x, int channels, int octaves, fl
 inline void encode_backward(const Sizes& s, const float* g, const float* encoding, float* gx, int n) {
   int C = s.channels;
   for (int p = 0; p < n; p += LANES) {
-    // LANES points' gradients, turned over so that points stand along the lanes
+    // gradients of LANES points, transposed so that lanes hold points
     float turned[256 * LANES] __attribute__((aligned(64)));
     for (int f = 0; f < s.E; f += LANES) transpose(g + p * s.E + f, s.E, turned + f * LANES);
     for (int c = 0; c < C; ++c) {
@@ -239,7 +239,7 @@ inline void encode_backward(const Sizes& s, const float* g, const float* encodin
   }
 }
 
-// t.q is set; the rest of a tile's density follows.
+// Computes a tile's density from t.q.
 inline void density_forward(const Sizes& s, const Layers& w, Tile& t) {
   int n = t.padded;
   for (int i = 0; i < 3; ++i) {
@@ -268,10 +268,10 @@ inline void density_forward(const Sizes& s, const Layers& w, Tile& t) {
   }
 }
 
-// From t.g_sigma (and t.g_encoding, which is set) to weights and t.gx (which is set to zero or to what colour added).
+// Backward pass from t.g_sigma and t.g_encoding to the weights and t.gx. t.gx must be zero or colour's gradient before.
 inline void density_backward(const Sizes& s, const Layers& w, const Transposed& wt, Tile& t, Layers& g) {
   int n = t.padded;
-  float* go = t.output;  // softplus' = logistic
+  float* go = t.output;  // the derivative of softplus is the logistic function
   for (int p = 0; p < n; p += LANES) {
     Vec o = load(t.output + p);
     Vec logistic = 1.0f / (1.0f + exp(-o));

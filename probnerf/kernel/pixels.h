@@ -1,6 +1,6 @@
-// What the pixels of a tile's rays say, and its gradient by density, colour, scale and range offset: the arithmetic of
-// probnerf.likelihood.pixel_terms.pixel_terms, with weights and probabilities as they are where that has logarithms. Nothing underflows:
-// every sum holds a constant share (the outliers of a range, the errors of a mask).
+// The pixel likelihood of a tile's rays, and its gradient with respect to density, colour, scale and range offset: the
+// arithmetic of probnerf.likelihood.pixel_terms.pixel_terms. Weights and probabilities are used directly instead of
+// their logarithms. Nothing underflows, because every sum has a constant term (range outliers, mask errors).
 #pragma once
 
 #include <math.h>
@@ -9,31 +9,31 @@
 
 namespace FARSIDE_NAMESPACE {
 
-// One ray that says something, in the order of its tile.
+// One informative ray, in tile order.
 struct Pixel {
-  int first, count;  // its crossings among the view's
+  int first, count;  // range of its crossings in the view
   bool object, coloured;
   float rgb[3], uniform, limit, weight;
 };
 
-// The view's crossings, all rays' one after another, each array [points].
+// The view's crossings, ray by ray. Each array is [points].
 struct Crossings {
-  float *at[3];      // in the view's frame
+  float *at[3];      // in the view frame
   float *t;
-  float *measured;   // range less the middle of the gap before the face
+  float *measured;   // range minus the middle of the gap before the face
   float *inverse_deviation, *peak, *floor;  // density of a range given this face: peak exp(-r^2/2) + floor
 };
 
-// Of every crossing of the view, for one particle, each array [points].
+// Values at every crossing of the view for one particle. Each array is [points].
 struct Composite {
   float *tau, *weight, *left;  // compositing weight; transmittance after the face
-  float *density, *slope;      // density of the range, its slope by the offset
+  float *density, *slope;      // density of the range, and its derivative by the offset
   Composite(int points, Arena& a) {
     for (float** p : {&tau, &weight, &left, &density, &slope}) *p = a.take(points);
   }
 };
 
-// Of every pixel, for one particle.
+// Values of every pixel for one particle.
 struct PixelSums {
   float hit, opacity, left, likelihood;
 };
@@ -43,12 +43,12 @@ struct PixelGradient {
   float log_scale = 0.0f, offset = 0.0f;
 };
 
-// A crossing whose compositing weight is less (of a free ray: whose optical depth, times what the pixel says against it) is
-// passed over. Sharp walls leave one crossing of ten: at 1e-8 the many tails together showed in the gradient (5e-4 of it),
-// at 1e-11 they do not, and it costs as little.
+// Crossings with a smaller compositing weight are skipped. (For a free ray: optical depth times its gradient.)
+// With sharp walls, one crossing in ten is left. At 1e-8 the sum of the skipped ones changed the gradient by 5e-4 of
+// its size. At 1e-11 the change is not visible, and the cost is the same.
 constexpr float NEGLIGIBLE = 1e-11f;
 
-// From a tile's densities, which its first pixel's first crossing begins, to all that needs no colour.
+// Computes all values that need no colour from a tile's densities, which start at its first pixel's first crossing.
 inline void composite(const PixelModel& m, const Crossings& view, const Pixel* pixels, int count, float per_density,
                       float offset, const Tile& t, Composite& c, PixelSums* sums) {
   int first = pixels[0].first;
@@ -87,8 +87,8 @@ inline void composite(const PixelModel& m, const Crossings& view, const Pixel* p
   }
 }
 
-// A pixel's term, and its gradient by the density and the colour of its crossings that count: those of `t` from `begin` to
-// `end`, which stand at `source` among the view's.
+// A pixel's term, and its gradient with respect to the density and colour of its kept crossings. In `t` these are
+// `begin` to `end`. `source` gives their indices in the view.
 inline void pixel_term(const PixelModel& m, const Pixel& ray, const PixelSums& of, const Composite& c, const int* source,
                        int begin, int end, Tile& t, PixelGradient& g) {
   g.value += ray.weight * logf(of.likelihood);

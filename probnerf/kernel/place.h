@@ -1,4 +1,4 @@
-// Where a tile's points are in the object's frame: the pose (probnerf.types.Pose) and the window (probnerf.rendering.foam.window).
+// A tile's points in the object frame: the pose (probnerf.types.Pose) and the window (probnerf.rendering.foam.window).
 #pragma once
 
 #include "field.h"
@@ -10,7 +10,7 @@ struct PoseMatrix {
   explicit PoseMatrix(const float* pose)
       : c(cosf(pose[0])), s(sinf(pose[0])), inverse(expf(-pose[3])), x(pose[1]), y(pose[2]), z(BASE_Z + pose[4]) {}
 
-  // A point, or a vector of them, of the view's frame.
+  // A point, or a vector of points, in the view frame.
   template <class T>
   void to_object(T px, T py, T pz, T* q) const {
     px -= x, py -= y, pz -= z;
@@ -21,7 +21,7 @@ struct PoseMatrix {
 };
 
 struct Window {
-  Vec value, slope;  // slope: the derivative by ...
+  Vec value, slope;  // slope: derivative with respect to ...
   Int axis;          // ... this coordinate
 };
 
@@ -41,7 +41,7 @@ inline Window window(Vec x, Vec y, Vec z) {
   return {u * u * (3.0f - 2.0f * u), slope, (outside & axis) | (~outside & 2)};
 }
 
-// 0, or not a number where a weight or the pose is none: a ReLU would hide it.
+// 0, or NaN if a weight or the pose is not finite. Without this, a ReLU would hide it.
 inline float nothing(const Sizes& s, const Layers& w, const float* pose) {
   float sum = 0.0f;
   for_each_part(s, w, [&](const float* part, int rows, int columns, int stride, bool transposed) {

@@ -1,12 +1,12 @@
-// Window x density at points of the view's frame. Threads take turns at pieces of one shape's points, whose places do not
-// depend on the threads' number: nor does the answer. Compiled once per instruction set.
+// Window x density at points of the view frame. Threads take pieces of one shape's points in turn. The pieces do not
+// depend on the number of threads, so the result does not either. Compiled once per instruction set.
 #include "place.h"
 
 namespace FARSIDE_NAMESPACE {
 
-constexpr int64_t PIECE = 1024;  // points taken at a time
+constexpr int64_t PIECE = 1024;  // points per piece
 
-struct Inside {  // a tile's points that are inside the window, and which of a shape's they are
+struct Inside {  // a tile's points inside the window, and their indices in the shape
   Layers weights;
   Tile tile;
   int64_t* index;

@@ -1,5 +1,5 @@
-// Vectors of floats by the compiler's own extension, and the few functions that they need. Compiled once per instruction
-// set, in a namespace of its own: no template of the standard library may be used where it would be shared between them.
+// Vectors of floats, with the compiler's vector extension, and a few functions of them. Compiled once per instruction
+// set, each in its own namespace. No standard library templates: their instantiations would be shared between the sets.
 #pragma once
 
 #include <math.h>
@@ -66,7 +66,7 @@ inline void transpose(const float* from, long stride, float* to) {
   for (int i = 0; i < LANES; ++i) store(to + i * LANES, rows[i]);
 }
 
-// Lane i: the sum of rows[i], of LANES rows, which it leaves spoilt.
+// Lane i is the sum of rows[i], for LANES rows. The rows are overwritten.
 template <int S = 1>
 inline Vec sums(Vec* rows) {
   if constexpr (S < LANES) {
@@ -81,12 +81,12 @@ inline Vec sums(Vec* rows) {
 
 // Round to nearest for |x| < 2^22.
 inline Vec nearest(Vec x) { return (x + 12582912.0f) - 12582912.0f; }
-inline Vec power_of_two(Vec n) {  // n whole, -126 to 127
+inline Vec power_of_two(Vec n) {  // n is an integer from -126 to 127
   return value((__builtin_convertvector(n, Int) + 127) << 23);
 }
 
 struct Exp {
-  Vec value, minus_one;  // exp(x), exp(x) - 1: the second keeps its digits near 0
+  Vec value, minus_one;  // exp(x), exp(x) - 1; the second is accurate near 0
 };
 
 // Cody and Waite's reduction, then the polynomial of cephes' expf.
@@ -170,7 +170,7 @@ inline void multiply_block(int k, const float* a, long ar, long ak, const float*
 template <int V>
 inline void multiply_columns(int rows, int k, const float* a, long ar, long ak, const float* b, long bk, float* c,
                              long cr) {
-  constexpr int R = LANES == 16 ? 8 : 4;  // as many sums as there are registers
+  constexpr int R = LANES == 16 ? 8 : 4;  // as many sums as fit in the registers
   int r = 0;
   for (; r + R <= rows; r += R) multiply_block<R, V>(k, a + r * ar, ar, ak, b, bk, c + r * cr, cr);
   if (R > 4 && r + 4 <= rows) {

@@ -1,5 +1,5 @@
-// log p(observation | weights, pose) and its gradient, particle by particle: one pass over tiles of whole rays, forwards
-// and at once backwards, so that nothing of size points x width is ever stored. Compiled once per instruction set.
+// log p(observation | weights, pose) and its gradient for each particle. One pass over tiles of whole rays does forward
+// and backward together, so no array of size points x width is stored. Compiled once per instruction set.
 #include "colour.h"
 #include "pixels.h"
 #include "place.h"
@@ -13,7 +13,7 @@ struct TileRange {
   int first_pixel, pixels, points;
 };
 
-// The view as tiles see it. With an arena that only counts, only the sizes are right.
+// The view, prepared for tiles. If the arena only counts, only the sizes are valid.
 struct Prepared {
   Pixel* pixels;
   float* directions;  // [pixels][3]
@@ -72,11 +72,11 @@ struct Prepared {
   }
 };
 
-// Crossings that count, of so many pixels one after another: what is left of a tile, or of several.
+// The kept crossings of consecutive pixels, from one tile or several.
 struct Few {
   Tile tile;
-  int* source;            // [tile] which of the view's crossings each is
-  int* ends;              // [rays] of each pixel: where its crossings end
+  int* source;            // [tile] index of each crossing in the view
+  int* ends;              // [rays] end of each pixel's crossings
   Direction* directions;  // [rays] of each coloured pixel
   int first_pixel = 0, pixels = 0;
   Few(const Sizes& s, int most_pixels, Arena& a) : tile(s, a), source((int*)a.take(s.tile)), ends((int*)a.take(most_pixels)) {
@@ -101,7 +101,7 @@ struct Scratch {
         sums((PixelSums*)a.take(most_pixels * (int64_t)sizeof(PixelSums) / 4 + 1)), few(s, most_pixels, a) {}
 };
 
-// The gradient by t.gx (and by the window, from t.g_sigma) brought back to fit and pose.
+// Backward pass from t.gx (and from t.g_sigma, through the window) to the fit and the pose.
 inline void points_backward(const Sizes& s, const Layers& w, Tile& t, Layers& g, const PoseMatrix& pose, float* g_pose) {
   int n = t.padded;
   for (int p = 0; s.radial && p < n; p += LANES) {
@@ -136,7 +136,7 @@ inline void points_backward(const Sizes& s, const Layers& w, Tile& t, Layers& g,
   g_pose[4] -= pose.inverse * sums[2];
 }
 
-// The terms of the pixels whose crossings stand in k.few, and their gradient; then it is empty.
+// The terms of the pixels with crossings in k.few, and their gradient. Empties k.few.
 inline void finish(const Sizes& s, const PixelModel& m, const Prepared& v, Scratch& k, const PoseMatrix& pose,
                    const Particle& o, PixelGradient& terms) {
   Few& few = k.few;
@@ -170,7 +170,7 @@ inline void finish(const Sizes& s, const PixelModel& m, const Prepared& v, Scrat
   few.pixels = t.count = 0;
 }
 
-// Densities of a tile's crossings, and what they say without colour.
+// Densities of a tile's crossings, and all terms without colour.
 inline void tile_forward(const Sizes& s, const PixelModel& m, const Prepared& v, const TileRange& range,
                          const PoseMatrix& pose, float offset, Scratch& k) {
   const Pixel* pixels = v.pixels + range.first_pixel;
@@ -209,7 +209,7 @@ inline void one_particle(const Sizes& s, const PixelModel& m, const Prepared& v,
       const float* weight = k.composite.weight + ray.first;
       int counted = 0;
       for (int p = 0; p < ray.count; ++p) counted += weight[p] > NEGLIGIBLE;
-      bool next = few.pixels && few.first_pixel + few.pixels != pixel;  // another thread has the tile between
+      bool next = few.pixels && few.first_pixel + few.pixels != pixel;  // another thread has the tile in between
       if (next || few.tile.count + counted > s.tile || (few.pixels && v.pixels[few.first_pixel].coloured != ray.coloured))
         finish(s, m, v, k, pose, o, terms);
       if (few.pixels == 0) few.first_pixel = pixel, few.tile.count = 0;
@@ -220,7 +220,7 @@ inline void one_particle(const Sizes& s, const PixelModel& m, const Prepared& v,
         direction_forward(s, k.weights, to);
       }
       int first = v.pixels[range.first_pixel].first;
-      for (int p = 0, end; p < ray.count; p = end) {  // runs of crossings that count
+      for (int p = 0, end; p < ray.count; p = end) {  // runs of kept crossings
         end = p + 1;
         if (!(weight[p] > NEGLIGIBLE)) continue;
         while (end < ray.count && weight[end] > NEGLIGIBLE) ++end;
