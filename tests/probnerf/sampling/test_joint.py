@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from probnerf.fields.cylinder import CylinderModel
-from probnerf.likelihood import dispatch as real
+from probnerf.likelihood import pixel_terms as real
 from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.likelihood.settings import Likelihood
 from probnerf.objects.cylinder_scenes import draw_pixels, grid_of_rays
@@ -84,6 +84,6 @@ MUTATIONS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_a_density_that_is_not_the_pixels_breaks_it(name: str) -> None:
-    module = mutant("probnerf.likelihood.dispatch", MUTATIONS[name])
+    module = mutant("probnerf.likelihood.pixel_terms", MUTATIONS[name])
     with pytest.raises(AssertionError):
         the_joint_stays(module)
