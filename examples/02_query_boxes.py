@@ -10,10 +10,16 @@ import farside
 SIDES = {"towards the camera": (1, 0), "left of it": (0, -1), "right of it": (0, 1), "behind it": (-1, 0)}
 
 
-def main(file: str = "out/one_frame/object_1.npz", risk: float = 0.05) -> dict[str, farside.QueryResult]:
-    """Print how likely a 4 cm box on each side of the object is free, and the verdict at a risk."""
-    (h,) = scene = farside.load(file)
-    middle, half = 0.62 * h.object_frame.half_extent, 0.02  # m; about where a handle would be
+def main(
+    file: str = "out/one_frame/object_1.npz", risk: float = 0.05, distance: float = 0.85
+) -> dict[str, farside.QueryResult]:
+    """Print how likely a box right beside the object's body is free, on each side, and the verdict at a risk."""
+    scene = farside.load(file)
+    if len(scene) != 1:
+        raise ValueError(f"{file} holds {len(scene)} objects; give the file of one")
+    (h,) = scene
+    # In half extents the body reaches to 0.7 at most and the cube to 1: a handle would be between.
+    middle, half = distance * h.object_frame.half_extent, 0.1 * h.object_frame.half_extent  # m
     answers = {}
     for name, (x, y) in SIDES.items():
         u, v = middle * x, middle * y  # object frame: x towards the camera, z up

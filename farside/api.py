@@ -98,10 +98,16 @@ def estimate(
     `ValueError` is raised.
     """
     begun = time.monotonic()
+    if budget_s is not None and not budget_s > 0:
+        raise ValueError(f"budget_s is {budget_s:g}; give more than 0, or None for no limit")
     if segments is None:
         segments = segment(frame)
     elif isinstance(segments, Segment):
         segments = [segments]
+    elif not all(isinstance(found, Segment) for found in segments):
+        raise ValueError(
+            "segments must come from farside.segment; give a label map to the frame: farside.Frame(..., label=labels)"
+        )
     weights = load_prior() if prior is None else prior
 
     def estimate_one(found: Segment, budget: float | None) -> Estimate:

@@ -42,7 +42,7 @@ def test_one_frame(
 def test_query_boxes(example: Callable, tmp_path: Path) -> None:
     """The body's handle points to the camera with 0.3 and away from it with 0.7; beside it there is nothing."""
     (file,) = farside.save(tmp_path, body_with_handle())
-    answers = example("02_query_boxes")(str(file))
+    answers = example("02_query_boxes")(str(file), distance=0.62)
     assert answers["towards the camera"].p_free == pytest.approx(0.7)
     assert answers["behind it"].p_free == pytest.approx(0.3)
     assert answers["left of it"].p_free == answers["right of it"].p_free == 1.0

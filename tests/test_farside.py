@@ -89,3 +89,12 @@ def test_estimate_tells_its_progress_and_names_what_it_leaves_out(
     assert scene.left_out == {1: "object 1 measures 90 cm"}
     with pytest.raises(ValueError, match="measures 90 cm"):
         farside.estimate(frame, both[0], prior=object())
+
+
+def test_what_cannot_be_meant_is_refused_with_the_remedy(frame: farside.Frame) -> None:
+    with pytest.raises(ValueError, match="give metres"):
+        farside.Frame(frame.rgb, 1000 * np.nan_to_num(frame.depth), frame.camera.K)
+    with pytest.raises(ValueError, match=r"label map to the frame: farside.Frame\(..., label=labels\)"):
+        farside.estimate(frame, np.zeros((2, 2), int))
+    with pytest.raises(ValueError, match="budget_s is -2; give more than 0"):
+        farside.estimate(frame, budget_s=-2)

@@ -21,7 +21,7 @@ from perception.sources.frame import Frame
 from probnerf.types import BASE_Z, UNKNOWN
 
 SHOWN = 4  # hypotheses in a picture
-_ROWS = 6  # of the summary
+_LINE, _LEGEND = 0.058, 0.17  # of the summary: height of a line of 8 points, and of the legend below (axes)
 _PIXELS = 180  # of a small picture's side
 _LOG2 = float(np.log(2.0))
 _DISAGREEMENT, _OCCUPIED = "RdPu", "OrRd"
@@ -204,14 +204,16 @@ def _add_bar(figure: Figure, colours: str | Colormap, top: float, axes: list[Axe
 
 
 def _write_summary(ax: Axes, h: Hypotheses) -> None:
-    text = [textwrap.fill(part, 41) for part in answer(summarise(h)).split("; ")]
-    ax.text(0.03, 1.0, "\n".join(text), va="top", fontsize=9, transform=ax.transAxes)
-    rows = {**figures(h), **diagnostics(h)}
-    for i, (name, value) in enumerate(list(rows.items())[:_ROWS]):
-        ax.text(0.03, 0.63 - 0.058 * i, name, fontsize=8, color="#666666", transform=ax.transAxes)
-        ax.text(0.36, 0.63 - 0.058 * i, value, fontsize=8, transform=ax.transAxes)
-    doubts = "\n".join(textwrap.fill(line, 50) for line in warnings(h))
-    ax.text(0.03, 0.29, doubts, va="top", fontsize=8, color="#b03020", transform=ax.transAxes)
+    lines = [line for part in answer(summarise(h)).split("; ") for line in textwrap.wrap(part, 41)]
+    ax.text(0.03, 1.0, "\n".join(lines), va="top", fontsize=9, transform=ax.transAxes)
+    doubts = [line for warning in warnings(h) for line in textwrap.wrap(warning, 46)]
+    top = 0.97 - _LINE * 9 / 8 * len(lines)
+    bottom = _LEGEND + _LINE * len(doubts)
+    rows = list({**figures(h), **diagnostics(h)}.items())  # the last matter least
+    for i, (name, value) in enumerate(rows[: max(0, int((top - bottom) / _LINE))]):
+        ax.text(0.03, top - _LINE * i, name, va="top", fontsize=8, color="#666666", transform=ax.transAxes)
+        ax.text(0.36, top - _LINE * i, value, va="top", fontsize=8, transform=ax.transAxes)
+    ax.text(0.03, bottom, "\n".join(doubts), va="top", fontsize=8, color="#b03020", transform=ax.transAxes)
     unseen = (
         "surface not measured, or out of its sight" if h.object_frame.sight_sigma > 0 else "surface out of its sight"
     )

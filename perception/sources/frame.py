@@ -11,6 +11,8 @@ from calibration.camera import Camera
 
 SATURATED = 65535  # depth count of 16 bits
 
+_FARTHEST_MEDIAN = 200.0  # m
+
 
 @dataclass(frozen=True, eq=False, init=False)
 class Frame:
@@ -51,6 +53,7 @@ class Frame:
             )
         if depth is not None:  # a sensor's zero or infinity is no distance
             depth = _plane("depth", depth, np.float32, rgb)
+            _check_metres(depth)
             with np.errstate(invalid="ignore"):
                 depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan))
         if label is not None:
@@ -67,6 +70,14 @@ def known_counts(counts: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]
     count, which stands for anything farther.
     """
     return np.where(counts == SATURATED, counts.dtype.type(0), counts)
+
+
+def _check_metres(depth: Float32[np.ndarray, "h w"]) -> None:
+    """Raises `ValueError` for depth that cannot be metres: millimetres are the usual mistake."""
+    few = depth[::8, ::8]
+    few = few[np.isfinite(few) & (few > 0)]
+    if len(few) and (median := float(np.median(few))) > _FARTHEST_MEDIAN:
+        raise ValueError(f"depth has a median of {median:.0f}; give metres (millimetres divided by 1000)")
 
 
 def _plane(name: str, values: Shaped[np.ndarray, "h w"], dtype: type, rgb: UInt8[np.ndarray, "h w 3"]) -> np.ndarray:

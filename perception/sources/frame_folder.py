@@ -58,15 +58,11 @@ def read_frame_folder(path: Path | str) -> Frame:
     except ValueError as error:
         raise ValueError(f"{path / 'meta.json'}: {error}") from None
     label = None if label is None else label.astype(np.int32)
-    return Frame(
-        rgb,
-        depth,
-        camera,
-        label=label,
-        stamp_ns=meta["stamp_ns"],
-        frame_id=meta["frame_id"],
-        T_world_camera=meta["T_world_camera"],
-    )
+    known = {name: meta[name] for name in ("stamp_ns", "frame_id", "T_world_camera")}
+    try:
+        return Frame(rgb, depth, camera, label=label, **known)
+    except ValueError as error:  # such as millimetres that depth_unit_m takes for metres
+        raise ValueError(f"{path}: {error}; check depth_unit_m in meta.json") from None
 
 
 def write_frame_folder(path: Path | str, frame: Frame) -> None:
