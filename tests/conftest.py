@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+import farside
+
 ROOT = Path(__file__).resolve().parent.parent
 
 # Set before anything imports jax, which reads them once; they reach the processes that tests start, too.
@@ -20,6 +22,8 @@ signal.signal(
 )  # run in the background, children would inherit its being ignored
 os.environ.setdefault("DEPTHAI_LEVEL", "error")  # its warning about a missing USB bus
 os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")  # its handlers end the process; Python raises
+
+farside.prepare = lambda: None  # what it sets would reach all tests of this process
 
 
 def pytest_configure(config: pytest.Config) -> None:
