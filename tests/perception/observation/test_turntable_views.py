@@ -38,12 +38,12 @@ LENSES = {
 
 @pytest.mark.parametrize("model", sorted(LENSES))
 def test_a_known_point_is_where_the_square_says(model: str) -> None:
-    """Depth that is its pixel's place in the frame: a point that projects there is found there, within 0.1 px."""
+    """Depth that is its pixel's place in the frame (0.1 m a pixel): a point is found there, within 0.1 px."""
     camera = Camera(640, 480, np.array([[300.0, 0, 310.0], [0, 302.0, 233.0], [0, 0, 1]]), LENSES[model], model)
     v, u = np.mgrid[:480, :640].astype(np.float32)
     rgb = np.zeros((480, 640, 3), np.uint8)
-    columns, rows = (square(Frame(rgb, place + 1, camera)).depth for place in (u, v))
-    view = square(Frame(rgb, u, camera))
+    columns, rows = (square(Frame(rgb, (place + 1) / 10, camera)).depth for place in (u, v))
+    view = square(Frame(rgb, u / 10, camera))
     rng = np.random.default_rng(0)
     at = rng.uniform(20, view.side - 20, (200, 2)).round()
     rays = np.column_stack([at, np.ones(200)]) @ np.linalg.inv(view.K).T
@@ -51,7 +51,9 @@ def test_a_known_point_is_where_the_square_says(model: str) -> None:
     x, y = at.astype(int).T
     there = view.inside[y, x]
     assert there.sum() > 100
-    found = np.column_stack([columns[y, x], rows[y, x]])[there] - 1  # whole pixels: depth is not interpolated
+    found = np.rint(
+        10 * np.column_stack([columns[y, x], rows[y, x]])[there] - 1
+    )  # whole pixels: depth is not interpolated
     assert np.abs(found - px[there]).max() < 0.5 + 0.1
 
 
