@@ -61,8 +61,11 @@ def _surface(objects: TabletopObject, seeds: Array) -> Solids:
         handle = PER_OBJECT // _HANDLE_SHARE
         around = (_handle_points(obj, k1, handle) - base) * obj.scale + shift
         point = start.at[:handle].set(jnp.where(obj.has_handle, around, start[:handle]))
-        for _ in range(4):  # descend to the surface; four steps suffice except where parts overlap
-            point = point - signed_distance(obj, point)[:, None] * _normal(obj, point)
+
+        def descend(_: int, point: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+            return point - signed_distance(obj, point)[:, None] * _normal(obj, point)
+
+        point = jax.lax.fori_loop(0, 4, descend, point)  # four steps suffice except where parts overlap
         normal = _normal(obj, point)
         rgb = colour(obj, point, normal)
         finite = jnp.all(jnp.isfinite(point + normal + rgb), axis=-1)
@@ -86,11 +89,11 @@ def _handle_points(obj: TabletopObject, key: PRNGKeyArray, count: int) -> Float[
 
 def _normal(obj: TabletopObject, points: Float[Array, "n 3"], step: float = 2e-3) -> Float[Array, "n 3"]:
     """Normalised gradient of the signed distance. By differences, since its square roots have none on the surface."""
-    ahead, behind = (
-        jnp.stack([signed_distance(obj, points + sign * step * axis) for axis in jnp.eye(3)], axis=-1)
-        for sign in (1.0, -1.0)
-    )
-    return _unit(ahead - behind)
+    axes = step * jnp.eye(3)
+    ahead, behind = jax.vmap(lambda offset: signed_distance(obj, points + offset))(
+        jnp.concatenate([axes, -axes])
+    ).reshape(2, 3, -1)
+    return _unit((ahead - behind).T)
 
 
 def _unit(v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
