@@ -13,11 +13,9 @@ density stays wide where a view is ambiguous. Without `solids` (None), training 
 and q(z) comes from the picture encoder.
 """
 
-import json
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +26,6 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from foundation.whole_file import whole_file
 from probnerf.likelihood.dispatch import map_with_gradient, weighted_terms
 from probnerf.likelihood.settings import Likelihood
 from probnerf.objects.tabletop import description, sample_object
@@ -37,6 +34,7 @@ from probnerf.prior.networks import ProbNeRF, Recognition
 from probnerf.rendering import foam
 from probnerf.training.batches import Batch, draw_batch, strata_of
 from probnerf.training.pictures import ViewSet
+from probnerf.training.run_folder import RunFolder
 from probnerf.training.settings import TrainConfig
 from probnerf.training.surface_samples import Solids, colour_samples, shape_samples
 from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
@@ -247,14 +245,6 @@ def train_step(
     return TrainState(model, recognition, optimiser, state.step + 1), {"loss": value, **parts}
 
 
-def save_checkpoint(path: Path, state: TrainState) -> None:
-    """Write the checkpoint atomically: a killed run leaves the old file or the new one."""
-    with whole_file(path) as part, part.open("wb") as file:
-        eqx.tree_serialise_leaves(file, state)
-        file.flush()
-        os.fsync(file.fileno())
-
-
 def train(
     model: ProbNeRF, solids: Solids | None, views: ViewSet, likelihood: Likelihood, config: TrainConfig, folder: Path
 ) -> Iterator[tuple[TrainState, dict[str, float]]]:
@@ -267,19 +257,9 @@ def train(
         raise ValueError(f"solid_steps is {config.solid_steps}; it must be 0 where there are pictures alone")
     if config.steps > config.solid_steps and views.rgb.shape[1] < config.views:
         raise ValueError(f"--views is {config.views} but objects have {views.rgb.shape[1]} pictures; give no more")
-    folder.mkdir(parents=True, exist_ok=True)
-    checkpoint, history = folder / "checkpoint.eqx", folder / "history.jsonl"
-    state = initial_state(jax.tree.map(jnp.copy, model), config)  # a copy, because a step donates its input buffers
-    settings = folder / "config.json"
-    described = json.dumps(asdict(config), indent=1)
-    if checkpoint.exists():
-        if settings.exists() and settings.read_text() != described:
-            raise ValueError(f"{folder} holds a run of another recipe: see {settings}, or give a fresh --out")
-        state = eqx.tree_deserialise_leaves(checkpoint, state)
-        lines = history.read_text().splitlines() if history.exists() else []
-        kept = [line for line in lines if json.loads(line)["step"] <= int(state.step)]
-        history.write_text("".join(line + "\n" for line in kept))
-    settings.write_text(described)
+    run = RunFolder(folder, config)
+    # a copy, because a step donates its input buffers
+    state = run.resume(initial_state(jax.tree.map(jnp.copy, model), config))
     strata = strata_of(views)
     start = int(state.step)
 
@@ -301,10 +281,9 @@ def train(
                 metrics = {k: float(v) for k, v in parts.items()}
                 if not np.isfinite(metrics["loss"]):
                     raise FloatingPointError(
-                        f"loss is {metrics['loss']} at step {done}; {checkpoint} holds an earlier step"
+                        f"loss is {metrics['loss']} at step {done}; {run.checkpoint} holds an earlier step"
                     )
-                with open(history, "a") as file:
-                    file.write(json.dumps({"step": done, "rays": step >= config.solid_steps, **metrics}) + "\n")
+                run.record({"step": done, "rays": step >= config.solid_steps, **metrics})
                 if done % config.checkpoint_every == 0 or done == config.steps:
-                    save_checkpoint(checkpoint, state)
+                    run.save(state)
                 yield state, {"step": done, **metrics}
