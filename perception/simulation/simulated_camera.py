@@ -70,6 +70,7 @@ class FaultlessImage:
     nearest: Float[np.ndarray, "h w"]  # m: the least and the largest depth within the pixel
     farthest: Float[np.ndarray, "h w"]
     label: Int32[np.ndarray, "h w"]  # 0: no object
+    gloss: Float[np.ndarray, "h w"] | None = None  # in [0, 1]; 0: matt, 1: a mirror's glare. None: objects 1, others 0
 
 
 def place_camera(position: tuple[float, float, float], target: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
