@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
 from perception.observation.object_frame import ObjectFrame, object_frame
 from perception.observation.segmentation import Segment, segment
-from perception.observation.settings import ObserveConfig, PlaneGuess
+from perception.observation.settings import ObserveConfig
 from perception.observation.visibility import seen_voxels
+from perception.simulation.sensor_draws import told_pose
 from perception.simulation.sensor_faults import sense
 from perception.simulation.simulated_camera import FaultlessImage, PlacedObject, TableScene, place_camera, render, truth
 from perception.sources.frame import Frame
@@ -164,11 +164,7 @@ def in_table(grid: int) -> Bool[np.ndarray, "g"]:
 
 def pose_as_stated(T_world_camera: Float[np.ndarray, "4 4"], seed: int) -> Float[np.ndarray, "4 4"]:
     """A camera's pose as its user tells it: height and tilt err by what `PlaneGuess` states, drawn by the seed."""
-    stated, rng = PlaneGuess(), np.random.default_rng([seed, 53])
-    T_stated = T_world_camera.copy()
-    T_stated[2, 3] += rng.normal(0.0, stated.height_sigma)
-    T_stated[:3, :3] @= Rotation.from_euler("x", rng.normal(0.0, stated.tilt_sigma), degrees=True).as_matrix()
-    return T_stated
+    return told_pose(T_world_camera, np.random.default_rng([seed, 53]))
 
 
 def hidden_vessel(seed: int, config: ViewConfig | None = None) -> VesselView | None:
