@@ -102,7 +102,8 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "websockets": ("node/viewer/page_guard.py",),  # viser's server
     "xxhash": ("node/ros/rmw_zenoh.py",),
     "tyro": ("node/__main__.py", "node/commands/options.py", "benchmarks/*", "examples/*"),
-    "trimesh": ("perception/answers/regions.py", "benchmarks/scenes/meshes.py"),
+    "trimesh": ("perception/answers/regions.py", "benchmarks/scenes/meshes.py", "benchmarks/scenes/strangers.py"),
+    "igl": ("benchmarks/scenes/strangers.py",),  # generalised winding numbers
     "rich": ("node/*", "benchmarks/*"),
     "PIL": ("node/figures/turning.py",),  # GIF
     "matplotlib": ("calibration/print_board.py", "node/figures/*", "benchmarks/*"),
