@@ -104,6 +104,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "tyro": ("node/__main__.py", "node/commands/options.py", "benchmarks/*", "examples/*"),
     "trimesh": ("perception/answers/regions.py", "benchmarks/scenes/meshes.py", "benchmarks/scenes/strangers.py"),
     "igl": ("benchmarks/scenes/strangers.py",),  # generalised winding numbers
+    "embreex": ("perception/simulation/ray_caster.py",),  # the extra `meshes`, imported where it is needed
     "rich": ("node/*", "benchmarks/*"),
     "PIL": ("node/figures/turning.py",),  # GIF
     "matplotlib": ("calibration/print_board.py", "node/figures/*", "benchmarks/*"),

@@ -46,13 +46,13 @@ def cavity_depth(picture: FaultlessImage) -> Float[np.ndarray, "h w"]:
     return found
 
 
-def fill_cavities(picture: FaultlessImage, share: float) -> FaultlessImage:
-    """Cavities shallower by `share` of the way to their opening, times their brightness.
+def fill_cavities(picture: FaultlessImage, deep: Float[np.ndarray, "h w"], share: float) -> FaultlessImage:
+    """Cavities (`cavity_depth`: `deep`, m) shallower by `share` of the way to their opening, times their brightness.
 
     Light that is reflected twice inside a bright concave thing (multi-path) blurs the pattern or the phase, and the
     sensor reports its inside too near and too flat: 1 closes a white mug.
     """
-    nearer = share * np.clip(luminance(picture), 0.0, 1.0) * cavity_depth(picture)
+    nearer = share * np.clip(luminance(picture), 0.0, 1.0) * deep
     return replace(
         picture,
         depth=picture.depth - nearer,
@@ -61,9 +61,9 @@ def fill_cavities(picture: FaultlessImage, share: float) -> FaultlessImage:
     )
 
 
-def in_cavity(picture: FaultlessImage) -> Float[np.ndarray, "h w"]:
-    """The brightness of pixels inside a cavity; 0 elsewhere."""
-    return np.where(cavity_depth(picture) > _DEEP, np.clip(luminance(picture), 0.0, 1.0), 0.0)
+def in_cavity(picture: FaultlessImage, deep: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """The brightness of pixels inside a cavity (`cavity_depth`); 0 elsewhere."""
+    return np.where(deep > _DEEP, np.clip(luminance(picture), 0.0, 1.0), 0.0)
 
 
 def fatten_edges(picture: FaultlessImage, width: int, step: float) -> FaultlessImage:

@@ -9,6 +9,7 @@ from scipy.special import ndtr
 
 from calibration.camera import Camera
 from perception.simulation.depth_faults import (
+    cavity_depth,
     fatten_edges,
     fill_cavities,
     in_cavity,
@@ -75,9 +76,10 @@ def sense(
     rng = np.random.default_rng([seed, 5])
     shape = picture.depth.shape
     lost = stereo_shadow(picture.depth, camera.K[0, 0], config.baseline)
-    lost |= _blind(picture, camera, np.random.default_rng([seed, 13]), config)
+    deep = cavity_depth(picture) if config.cavity or config.cavity_lost else np.zeros(shape)
+    lost |= _blind(picture, deep, camera, np.random.default_rng([seed, 13]), config)
     if config.cavity:
-        picture = fill_cavities(picture, config.cavity)
+        picture = fill_cavities(picture, deep, config.cavity)
     if config.fattening:
         picture = fatten_edges(picture, config.fattening, config.edge)
     with np.errstate(invalid="ignore"):
@@ -114,7 +116,11 @@ def sense(
 
 
 def _blind(
-    picture: FaultlessImage, camera: Camera, rng: np.random.Generator, config: SensorConfig
+    picture: FaultlessImage,
+    deep: Float[np.ndarray, "h w"],
+    camera: Camera,
+    rng: np.random.Generator,
+    config: SensorConfig,
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels without depth because of what they look at: dark, shiny, inside a bright cavity, at a rim."""
     shape = picture.depth.shape
@@ -126,7 +132,7 @@ def _blind(
         glare = np.clip(2.0 - 2.0 * mirror_angle(picture.depth, camera, config.baseline) / config.shiny, 0.0, 1.0)
         fails = np.maximum(fails, gloss * np.nan_to_num(glare))
     if config.cavity_lost:
-        fails = np.maximum(fails, config.cavity_lost * in_cavity(picture))
+        fails = np.maximum(fails, config.cavity_lost * in_cavity(picture, deep))
     if config.rim_lost:
         with np.errstate(invalid="ignore"):
             steps = ~(picture.farthest - picture.nearest < config.edge)

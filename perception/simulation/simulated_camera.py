@@ -113,7 +113,7 @@ def _shoot(
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Int32[np.ndarray, "n"]]:
     """Colour, distance along the ray (m, inf: nothing) and object id of unit rays in the camera frame."""
     origin, directions = T_world_camera[:3, 3], rays @ T_world_camera[:3, :3].T
-    rgb, distance = _surroundings(scene, origin, directions)
+    rgb, distance = surroundings(scene, origin, directions)
     label = np.zeros(len(rays), np.int32)
     for i, placed in enumerate(scene.objects, start=1):
         T, h = np.linalg.inv(placed.T_world_object), placed.half_extent
@@ -147,21 +147,11 @@ def _meets_box(
     return np.minimum(a, b).max(axis=1) <= np.maximum(a, b).min(axis=1)
 
 
-def _surroundings(
+def surroundings(
     scene: TableScene, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
     """Colour and distance (m) of the table, the floor or the wall behind."""
-
-    def meet(axis: int, at: float) -> tuple[np.ndarray, np.ndarray]:
-        with np.errstate(divide="ignore"):
-            t = (at - origin[axis]) / directions[:, axis]
-        t = np.where(t > 0, t, np.inf)
-        return t, origin + np.where(np.isfinite(t), t, 0.0)[:, None] * directions
-
-    table, on_table = meet(2, 0.0)
-    table[(np.abs(on_table[:, :2]) > scene.table).any(axis=1)] = np.inf
-    floor, on_floor = meet(2, _FLOOR)
-    wall, _ = meet(0, _WALL)
+    (table, on_table), (floor, on_floor), wall = _planes(scene, origin, directions)
     distance = np.minimum(np.minimum(table, floor), wall)
     colour = np.where((wall < floor)[:, None], scene.wall_colour, 0.55 * np.array(scene.wall_colour))
     x, y = on_floor[:, 0], on_floor[:, 1]
@@ -177,3 +167,27 @@ def _surroundings(
         gap = np.maximum(np.hypot(x - placed.x, y - placed.y) - reach, 0.0)
         wood = wood * (1.0 - 0.45 * np.exp(-gap / (0.3 * reach)))[:, None]
     return np.where((table <= distance)[:, None], wood, colour), distance
+
+
+def room_distance(
+    scene: TableScene, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n"]:
+    """Distance (m) of the table, the floor or the wall behind alone."""
+    (table, _), (floor, _), wall = _planes(scene, origin, directions)
+    return np.minimum(np.minimum(table, floor), wall)
+
+
+def _planes(
+    scene: TableScene, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Distance (m, inf: none) and point on the table and on the floor, and distance of the wall."""
+
+    def meet(axis: int, at: float) -> tuple[np.ndarray, np.ndarray]:
+        with np.errstate(divide="ignore"):
+            t = (at - origin[axis]) / directions[:, axis]
+        t = np.where(t > 0, t, np.inf)
+        return t, origin + np.where(np.isfinite(t), t, 0.0)[:, None] * directions
+
+    table, on_table = meet(2, 0.0)
+    table[(np.abs(on_table[:, :2]) > scene.table).any(axis=1)] = np.inf
+    return (table, on_table), meet(2, _FLOOR), meet(0, _WALL)[0]
