@@ -82,6 +82,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "cv2": ("calibration/*", "perception/*", "probnerf/training/srn_dataset.py"),  # the last: PNG files, resized
     "scipy": (
         "node/ros/messages.py",
+        "probnerf/objects/household_parts.py",  # splines
         "probnerf/rendering/occupancy.py",
         "probnerf/training/batches.py",
         "perception/*",
@@ -102,9 +103,15 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "websockets": ("node/viewer/page_guard.py",),  # viser's server
     "xxhash": ("node/ros/rmw_zenoh.py",),
     "tyro": ("node/__main__.py", "node/commands/options.py", "benchmarks/*", "examples/*"),
-    "trimesh": ("perception/answers/regions.py", "benchmarks/scenes/meshes.py", "benchmarks/scenes/strangers.py"),
+    "trimesh": (
+        "perception/answers/regions.py",
+        "probnerf/objects/household.py",
+        "benchmarks/scenes/meshes.py",
+        "benchmarks/scenes/strangers.py",
+    ),
     "igl": ("benchmarks/scenes/strangers.py",),  # generalised winding numbers
     "embreex": ("perception/simulation/ray_caster.py",),  # the extra `meshes`, imported where it is needed
+    "manifold3d": ("probnerf/objects/household_parts.py",),  # the same extra: exact booleans of solids
     "rich": ("node/*", "benchmarks/*"),
     "PIL": ("node/figures/turning.py",),  # GIF
     "matplotlib": ("calibration/print_board.py", "node/figures/*", "benchmarks/*"),
