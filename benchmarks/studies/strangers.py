@@ -19,9 +19,12 @@ half everywhere scores 0.693.
 - free: share of points with p <= 0.05. free_occupied: share of these that are occupied. Every object has the same
   weight, whatever the number of its points.
 - out_of_model: share of objects that are flagged.
+- outside: share of the occupied points that lie outside the cube in which perception looks for the object, where an
+  answer is always "free".
 - refused: objects that perception does not take. They have no answer, and no part in any mean.
 """
 
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -122,12 +125,14 @@ def _answers(
         found = segment(seen.frame, 1)[0]
     except ValueError as error:
         return {method: {"refused": str(error)} for method in METHODS}
+    begun = time.monotonic()
     smooth = hilbert_map(seen.frame, found, map_config).p_occupied(points)
+    seconds = round(time.monotonic() - begun, 2)
     try:
         answered = _of_perception(seen.frame, found, points, occupied, prior, config, options)
     except ValueError as error:
         answered = {method: {"refused": str(error)} for method in (QUERIED, ALONE)}
-    return {**answered, RIVAL: _told(smooth, occupied)}
+    return {**answered, RIVAL: {**_told(smooth, occupied), "seconds": seconds}}
 
 
 def _of_perception(
@@ -150,7 +155,9 @@ def _of_perception(
         stages=None if options.budget_s else options.stages,
     )
     h, checks = made.hypotheses, made.hypotheses.diagnostics
+    beyond = h.voxels("camera", *points[occupied].T) < 0
     state = {
+        "outside": round(float(beyond.mean()), 4) if len(beyond) else None,
         "out_of_model": bool(h.out_of_model),
         "explained": round(checks.explained, 4),
         "failed": int(np.nan_to_num(checks.failed_populations)),
@@ -206,9 +213,7 @@ def _method_rows(method: str, condition: str, own: list[Line]) -> list[Row]:
         "free": float(called.mean()),
         "free_occupied": float(wrong.sum() / called.sum()) if called.any() else 0.0,
     }
-    if "out_of_model" in own[0]:
-        values["out_of_model"] = float(np.mean([line["out_of_model"] for line in own]))
-        values["seconds"] = float(np.mean([line["seconds"] for line in own]))
+    values |= {k: float(np.nanmean(_values(own, k))) for k in ("out_of_model", "outside", "seconds") if k in own[0]}
     rows = [Row("strangers", method, condition, k, v, "s" * (k == "seconds"), len(own)) for k, v in values.items()]
     for metric in ("log_score", "balanced"):
         rows += mean_rows("strangers", method, condition, metric, _values(own, metric), "nats")

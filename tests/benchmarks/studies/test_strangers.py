@@ -19,7 +19,7 @@ P = {ALONE: [0.9, 0.8, 0.01, 0.2], QUERIED: [0.9, 0.9, 0.4, 0.4], RIVAL: [0.6, 0
 
 def line(method: str, name: str, p: list[float], prior: str = "p") -> dict:
     told = {"points": 4, "occupied": 2, **point_scores(np.array(p), OCCUPIED)}
-    state = {"out_of_model": False, "seconds": 1.0} if method != RIVAL else {}
+    state = {"out_of_model": False, "outside": 0.1, "seconds": 1.0} if method != RIVAL else {}
     same = {"prior": prior, "settings": {}, "seed": 0, "condition": GSO}
     return {"revision": "r", "machine": "m", **same, "method": method, "object": name, **told, **state}
 
@@ -40,6 +40,7 @@ def test_rows_are_summed_up_and_paired() -> None:
     assert of(GSO, ALONE, "balanced_over_one_half") == pytest.approx(ours - half)
     assert of(GSO, ALONE, "balanced_over_hilbert_map") == pytest.approx(ours + np.log(0.6))
     assert of(GSO, ALONE, "better_than_hilbert_map") == 1.0 and of(GSO, ALONE, "free") == 0.25
+    assert of(GSO, ALONE, "outside") == pytest.approx(0.1) and np.isnan(of(GSO, RIVAL, "outside"))
     assert (of(GSO, ALONE, "refused"), of.count(GSO, ALONE, "refused")) == (1.0, 4)
     assert len(found.tables[0].lines) == 3 and "1 of 4 refused" in found.tables[1].lines[-1][0]
     assert found.picture().axes and summary([], Options()) is None
