@@ -296,14 +296,17 @@ def _draw(lines: Sequence[Line]) -> Figure:
     """Balanced scores of every object beside the rival's."""
     figure = Figure(figsize=(6, 6), layout="constrained")
     ax = figure.subplots()
+    most = 1.0
     for condition, colour in zip(SETS.values(), ("tab:blue", "tab:red"), strict=True):
         ours, rival = (_by_object(lines, method, condition) for method in (ALONE, RIVAL))
-        names = [name for name in ours if name in rival]
-        a, b = (_values([own[name] for name in names], "balanced") for own in (rival, ours))
-        ax.plot(a, b, "o", color=colour, label=f"{condition} ({len(names)})", markersize=4)
+        if names := [name for name in ours if name in rival]:
+            a, b = (_values([own[name] for name in names], "balanced") for own in (rival, ours))
+            ax.plot(a, b, "o", color=colour, label=f"{condition} ({len(names)})", markersize=4)
+            most = max(most, float(np.nanmax([a, b])))
     ax.axline((0.5, 0.5), slope=1.0, color="0.7", linewidth=0.8)
     ax.axhline(DONT_KNOW, color="k", linewidth=0.8, linestyle=":", label="one half everywhere")
     ax.axvline(DONT_KNOW, color="k", linewidth=0.8, linestyle=":")
-    ax.set(xlabel="balanced score of the map without shapes, nats", ylabel="of the hypotheses, nats", aspect="equal")
+    ax.set(xlim=(0.0, 1.05 * most), ylim=(0.0, 1.05 * most), aspect="equal")
+    ax.set(xlabel="balanced score of the map without shapes, nats", ylabel="of the hypotheses, nats")
     ax.legend(fontsize=8)
     return figure
