@@ -15,6 +15,7 @@ def crop(frame: Frame, segment: Segment, cube: ObjectFrame, size: int) -> Encode
     """The encoder's picture: the frame as seen by a camera at the same place that looks at the cube's centre.
 
     A rotation of the camera moves no parallax, so this is a look-up: each pixel takes the nearest one of the frame.
+    Without depth the object's pixels have colour alone.
     """
     centre = cube.to_cube(np.zeros(3))
     tan_half = ENCODER_RADIUS / float(np.linalg.norm(centre))
@@ -27,8 +28,7 @@ def crop(frame: Frame, segment: Segment, cube: ObjectFrame, size: int) -> Encode
     inside = (rays[:, 2] > 0) & np.all((pixels >= 0) & (pixels < [width, height]), axis=1)
     u, v = np.where(inside[:, None], pixels, 0).T
     status = np.where(inside, segment.status[v, u], UNKNOWN)
-    assert frame.depth is not None
-    z = frame.depth[v, u]
+    z = np.full(len(v), np.nan, np.float32) if frame.depth is None else frame.depth[v, u]
     range_cube = np.where(np.isfinite(z), z, 0.0) / np.maximum(rays[:, 2], 1e-6) / cube.half_extent
     is_object = status == OBJECT
     return EncoderPicture(

@@ -49,7 +49,7 @@ def observe(
     cube = cube or object_frame(frame, segment, config)
     window = _window_pixels(frame, segment, cube, config)
     chosen = _chosen_pixels(window, config, np.random.default_rng(seed))
-    return _observation(window, chosen, _pose_sigma(frame.camera, cube, config), cube, config), cube
+    return _observation(window, chosen, pose_widths(frame.camera, cube, config), cube, config), cube
 
 
 def _window_pixels(frame: Frame, segment: Segment, cube: ObjectFrame, config: ObserveConfig) -> _WindowPixels:
@@ -149,7 +149,7 @@ def _observation(
     )
 
 
-def _pose_sigma(camera: Camera, cube: ObjectFrame, config: ObserveConfig) -> Float[np.ndarray, "5"]:
+def pose_widths(camera: Camera, cube: ObjectFrame, config: ObserveConfig) -> Float[np.ndarray, "5"]:
     """Prior standard deviations of x, y, log-scale, range offset and z, in the order of `Observation.pose_sigma`."""
     own = [
         cube.xy_sigma + cube.along_sigma,
