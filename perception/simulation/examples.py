@@ -8,6 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -86,10 +87,11 @@ def example_of(
     except ValueError as error:
         return str(error)
     picture = crop(seen, found, cube, size)
+    host: dict[str, Any] = {name: np.asarray(value) for name, value in vars(picture).items()}
     pose_sigma = pose_widths(frame.camera, cube, config)
     offset = 0.0 if true_depth is None else _range_offset(frame, found, true_depth) / cube.half_extent
     return Example(
-        picture=EncoderPicture(**{name: np.asarray(value) for name, value in vars(picture).items()}),
+        picture=EncoderPicture(**host),
         pose_sigma=pose_sigma,
         pose=_position(cube, T_camera_object, placed.half_extent, offset, pose_sigma, rng),
         cube=cube,
@@ -112,7 +114,7 @@ def draw_example(
     view = draw_view(rng, shape, others, views)
     picture = render_meshes(view.scene, view.camera, view.T_world_camera)
     frame = sense(picture, view.camera, view.T_world_camera, int(rng.integers(1 << 31)), draw_sensor(rng))
-    if not (frame.label == 1).any():
+    if not (picture.label == 1).any():
         return "no pixel shows the object"
     without, own, wrong, known = rng.random(4) < (draws.no_depth, draws.own_mask, draws.wrong_plane, draws.pose_known)
     return example_of(
@@ -141,7 +143,7 @@ def draw_examples(
     examples, reasons = [], Counter[str]()
     for seed in seeds:
         rng = np.random.default_rng([seed, 67])
-        drawn = draw_example(rng, shapes[rng.integers(len(shapes))], shapes, size, draws, views)
+        drawn = draw_example(rng, shapes[int(rng.integers(len(shapes)))], shapes, size, draws, views)
         if isinstance(drawn, Example):
             examples.append(drawn)
         else:

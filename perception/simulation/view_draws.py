@@ -52,7 +52,7 @@ def draw_view(
 ) -> DrawnView:
     """A random view of a shape; `others` may stand about, beside boxes of all sizes."""
     draws = draws or ViewDraws()
-    target = PlacedMesh(shape, *rng.uniform(-0.05, 0.05, 2), rng.uniform(-np.pi, np.pi))
+    target = PlacedMesh(shape, rng.uniform(-0.05, 0.05), rng.uniform(-0.05, 0.05), rng.uniform(-np.pi, np.pi))
     focal = rng.uniform(*draws.focal)
     K = np.array([[focal, 0, draws.width / 2], [0, focal, draws.height / 2], [0, 0, 1]])
     camera = Camera(draws.width, draws.height, K, np.zeros(5))
@@ -117,7 +117,7 @@ def _stand(target: PlacedMesh, rng: np.random.Generator, draws: ViewDraws) -> Fl
 
 def _other(rng: np.random.Generator, shape: MeshShape, others: Sequence[MeshShape]) -> MeshShape:
     if others and rng.random() < 0.6:
-        return others[rng.integers(len(others))]
+        return others[int(rng.integers(len(others)))]
     return box_shape(rng.uniform(0.3, 1.8, 3) * shape.half_extent, rng.uniform(0.1, 0.9, 3))
 
 
