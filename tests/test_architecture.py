@@ -76,7 +76,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
         "benchmarks/*",
     ),
     "equinox": ("probnerf/*", "benchmarks/*"),
-    "optax": ("probnerf/sampling/*", "probnerf/training/elbo.py"),
+    "optax": ("probnerf/sampling/*", "probnerf/training/elbo.py", "probnerf/training/posterior_flow.py"),
     "safetensors": ("probnerf/prior/checkpoint.py",),
     "blackjax": (),  # an independent sampler to test against
     "cv2": ("calibration/*", "perception/*", "probnerf/training/srn_dataset.py"),  # the last: PNG files, resized

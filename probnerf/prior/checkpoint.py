@@ -1,10 +1,10 @@
-"""Priors on disk: one safetensors file (which cannot execute code) with named arrays and metadata."""
+"""Priors and posterior networks on disk: safetensors files (which cannot execute code) with arrays and metadata."""
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -13,8 +13,12 @@ from safetensors.numpy import save
 
 from foundation.whole_file import write_whole
 from probnerf.prior.networks import PRESETS, ProbNeRF
+from probnerf.prior.posterior_flow import NetworkSizes, PosteriorNetwork
+
+M = TypeVar("M")
 
 FORMAT = "farside-prior-1"
+NETWORK_FORMAT = "farside-posterior-network-1"
 SHIPPED = Path(__file__).parent / "weights" / "tabletop.safetensors"
 
 
@@ -27,7 +31,16 @@ class Prior:
     hash: str  # of the file's bytes; identifies the prior in every posterior
 
 
-def _named(model: ProbNeRF) -> dict[str, Any]:
+@dataclass(frozen=True)
+class TrainedNetwork:
+    """A trained posterior network and where it comes from."""
+
+    network: PosteriorNetwork
+    metadata: dict[str, Any]  # sizes, prior (its hash), recipe, validation figures
+    hash: str  # of the file's bytes
+
+
+def _named(model: Any) -> dict[str, Any]:
     leaves = jax.tree_util.tree_flatten_with_path(model)[0]
     return {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in leaves}
 
@@ -48,26 +61,76 @@ def load_prior(path: Path | None = None, preset: str | None = None) -> Prior:
     path = SHIPPED if path is None else Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such prior; train one with `farside train`, or omit the option")
-    try:
-        with safe_open(path, framework="np") as file:
-            story = json.loads((file.metadata() or {}).get("farside", "{}"))
-            arrays = {name: file.get_tensor(name) for name in file.keys()}
-    except (SafetensorError, json.JSONDecodeError, OSError) as error:
-        raise ValueError(f"{path} is not a readable prior ({error}); train one with `farside train`") from None
+    story, arrays = _read(path, "prior", "train one with `farside train`")
     if story.get("format") != FORMAT or story.get("preset") not in PRESETS:
         raise ValueError(f"{path} is not a prior of format {FORMAT} with a preset of {', '.join(PRESETS)}")
     if preset is not None and story["preset"] != preset:
         raise ValueError(f"{path} holds preset '{story['preset']}', not '{preset}'; give weights of that preset")
     # shapes only: initialising weights just to replace them would take seconds
     model = jax.eval_shape(lambda key: ProbNeRF(PRESETS[story["preset"]], key), jax.random.key(0))
+    model = _filled(model, arrays, path, f"preset '{story['preset']}'")
+    return Prior(model, story, _hash(path))
+
+
+def save_posterior_network(path: Path, network: PosteriorNetwork, prior: str, metadata: dict[str, Any]) -> None:
+    """Write atomically, in half precision. `prior` is the hash of the prior that it was trained for.
+
+    `metadata` must be JSON-serialisable. Raises ValueError if a weight is not finite in half precision.
+    """
+    with np.errstate(over="ignore"):
+        arrays = {name: np.ascontiguousarray(leaf, np.float16) for name, leaf in _named(network).items()}
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"{path}: array {name} is not finite in half precision; nothing was written")
+    story = {"format": NETWORK_FORMAT, "sizes": asdict(network.sizes), "prior": prior, **metadata}
+    write_whole(path, save(arrays, metadata={"farside": json.dumps(story, sort_keys=True)}))
+
+
+def load_posterior_network(path: Path, prior: Prior) -> TrainedNetwork:
+    """Read the posterior network of `prior`, in single precision.
+
+    Raises FileNotFoundError if there is no file. Raises ValueError if it is not a posterior network, is damaged, or has
+    another architecture or another prior. Messages have one line.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such posterior network; train one for the prior {prior.hash}")
+    story, arrays = _read(path, "posterior network", "train it again")
+    if story.get("format") != NETWORK_FORMAT:
+        raise ValueError(f"{path} has format {story.get('format')}, not {NETWORK_FORMAT}; train it again")
+    if story.get("prior") != prior.hash:
+        raise ValueError(f"{path} was trained for the prior {story.get('prior')}, not for {prior.hash}; train it again")
+    try:
+        sizes = NetworkSizes(**story["sizes"])
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path} has sizes of another architecture ({error}); train it again") from None
+    if sizes.latent != prior.model.latent:
+        raise ValueError(f"{path} has {sizes.latent} latents, the prior has {prior.model.latent}; train it again")
+    network = jax.eval_shape(lambda key: PosteriorNetwork(sizes, key), jax.random.key(0))
+    arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
+    return TrainedNetwork(_filled(network, arrays, path, "this architecture"), story, _hash(path))
+
+
+def _read(path: Path, what: str, remedy: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """A file's metadata and arrays."""
+    try:
+        with safe_open(path, framework="np") as file:
+            story = json.loads((file.metadata() or {}).get("farside", "{}"))
+            return story, {name: file.get_tensor(name) for name in file.keys()}
+    except (SafetensorError, json.JSONDecodeError, OSError) as error:
+        raise ValueError(f"{path} is not a readable {what} ({error}); {remedy}") from None
+
+
+def _filled(model: M, arrays: dict[str, np.ndarray], path: Path, owner: str) -> M:
+    """The model, given by its shapes, with the arrays in their places."""
     named = _named(model)
     for name, leaf in named.items():
         found = arrays.get(name)
         if found is None or found.shape != leaf.shape:
             shape = "missing" if found is None else f"of shape {list(found.shape)}"
-            raise ValueError(
-                f"{path}: array {name} is {shape}, preset '{story['preset']}' needs {list(leaf.shape)}; train it again"
-            )
+            raise ValueError(f"{path}: array {name} is {shape}, {owner} needs {list(leaf.shape)}; train it again")
     leaves = jax.device_put([arrays[name] for name in named])
-    model = jax.tree.unflatten(jax.tree.structure(model), leaves)
-    return Prior(model, story, hashlib.sha256(path.read_bytes()).hexdigest()[:16])
+    return jax.tree.unflatten(jax.tree.structure(model), leaves)
+
+
+def _hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]

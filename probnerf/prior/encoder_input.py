@@ -16,6 +16,16 @@ def camera_features(T_object_camera: Float[Array, "4 4"], tan_half_fov: Float[Ar
     )
 
 
+def pixel_directions(
+    size: int, T_object_camera: Float[Array, "4 4"], tan_half_fov: Float[Array, ""]
+) -> Float[Array, "s s 3"]:
+    """Unit directions, in the object frame, of the rays through a square picture's pixels."""
+    pixel = ((jnp.arange(size) + 0.5) / (0.5 * size) - 1.0) * tan_half_fov
+    v, u = jnp.meshgrid(pixel, pixel, indexing="ij")
+    rays = jnp.stack([u, v, jnp.ones_like(u)], axis=-1)
+    return rays / jnp.linalg.norm(rays, axis=-1, keepdims=True) @ T_object_camera[:3, :3].T
+
+
 def encoder_image(
     rgb: Float[Array, "s s 3"],
     distance: Float[Array, "s s"],
@@ -32,10 +42,7 @@ def encoder_image(
     size = rgb.shape[0]
     known = unknown < 0.5
     mask = (distance != 0.0) & known
-    pixel = ((jnp.arange(size) + 0.5) / (0.5 * size) - 1.0) * tan_half_fov
-    v, u = jnp.meshgrid(pixel, pixel, indexing="ij")
-    rays = jnp.stack([u, v, jnp.ones_like(u)], axis=-1)
-    rays = rays / jnp.linalg.norm(rays, axis=-1, keepdims=True) @ T_object_camera[:3, :3].T
+    rays = pixel_directions(size, T_object_camera, tan_half_fov)
     points = T_object_camera[:3, 3] + distance[..., None] * rays
     has_point = mask & (distance > 0.0)
     place = with_radius(jnp.where(has_point[..., None], points, 0.0).reshape(-1, 3).T)

@@ -32,3 +32,34 @@ class TrainConfig:
     checkpoint_every: int = 500
     log_every: int = 50
     map_batch: int | None = None  # objects per vectorised chunk of the field (None: one by one, best on a CPU)
+
+
+@dataclass(frozen=True)
+class PosteriorTrainConfig:
+    """The recipe of a posterior network. Shares are of the pictures in each step."""
+
+    steps: int = 60_000
+    batch: int = 128  # pictures per step
+    learning_rate: float = 1e-3
+    final_learning_rate: float = 1e-5
+    warmup: int = 1_000
+    clip: float = 20.0  # norm of the gradient, nats
+    average: float = 0.999  # decay of the weights' moving average
+    without_depth: float = 0.25  # share without any range
+    known_pose: float = 0.15  # share with the pose given
+    occluded: float = 0.5  # share behind a random occluder
+    most_hidden: float = 0.8  # largest share of the object that it hides
+    validation: float = 0.05  # share of the objects that are never trained on
+    validation_pictures: int = 1_024
+    validate_every: int = 1_000
+    log_every: int = 50
+    checkpoint_every: int = 500
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        shares = ("without_depth", "known_pose", "occluded", "most_hidden", "validation")
+        for name in shares:
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be between 0 and 1")
+        if not 0.0 <= self.average < 1.0:
+            raise ValueError(f"average is {self.average}; it must be at least 0 and below 1")
