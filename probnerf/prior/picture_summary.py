@@ -169,6 +169,7 @@ class PictureSummary(eqx.Module):
         # sum over points before the linear layer, which commutes with it: ten times cheaper to train
         total = jnp.concatenate([angular.T @ hidden, jnp.sum(angular, axis=0)[:, None]], axis=1)
         total = total / (jnp.sum(weight) + 1e-3 * len(weight))
+        assert self.points.last.bias is not None
         last = jnp.concatenate([self.points.last.weight, self.points.last.bias[:, None]], axis=1)
         last = last.reshape(1 + self.harmonics, -1, last.shape[1])
         return jnp.einsum("mh,mch->mc", total, jnp.concatenate([last, last[1:]]))

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from foundation.whole_file import whole_file
 from probnerf.prior.posterior_network import EncoderPicture
 from probnerf.training.settings import PosteriorTrainConfig
-from probnerf.types import BASE_Z
+from probnerf.types import BASE_Z, on_device
 
 
 @dataclass(frozen=True)
@@ -96,18 +96,18 @@ def changed(pictures: PictureSet, rows: np.ndarray, rng: np.random.Generator, co
     distance = np.where(flat[:, None, None] & (distance > 0), -1.0, distance)
     return Examples(
         picture=EncoderPicture(
-            np.asarray(pictures.rgb[rows]),
-            distance.astype(np.float16),
-            unknown,
-            np.where(known[:, None, None], T_known, T).astype(np.float32),
-            np.asarray(pictures.tan_half_fov[rows]),
+            on_device(pictures.rgb[rows], np.uint8),
+            on_device(distance, np.float16),
+            on_device(unknown, np.bool_),
+            on_device(np.where(known[:, None, None], T_known, T)),
+            on_device(pictures.tan_half_fov[rows]),
         ),
-        pose_sigma=sigma,
-        known=known.astype(np.float32),
-        yaw=np.where(known, 0.0, yaw).astype(np.float32),
-        pose=np.where(known[:, None], 0.0, pose[:, :3]).astype(np.float32),
-        mean=np.asarray(pictures.mean[rows], np.float32),
-        sd=np.asarray(pictures.sd[rows], np.float32),
+        pose_sigma=on_device(sigma),
+        known=on_device(known),
+        yaw=on_device(np.where(known, 0.0, yaw)),
+        pose=on_device(np.where(known[:, None], 0.0, pose[:, :3])),
+        mean=on_device(pictures.mean[rows]),
+        sd=on_device(pictures.sd[rows]),
     )
 
 

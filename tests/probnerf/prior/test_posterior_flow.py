@@ -38,8 +38,7 @@ def features(request, network: PosteriorNetwork) -> PictureFeatures:
 
 def _normal(x: jax.Array, sd: float) -> np.ndarray:
     """Log-density of N(0, sd^2 I)."""
-    x = np.asarray(x, np.float64)
-    return np.sum(-0.5 * (x / sd) ** 2 - np.log(sd) - 0.5 * np.log(2 * np.pi), axis=-1)
+    return np.sum(-0.5 * (np.asarray(x, np.float64) / sd) ** 2 - np.log(sd) - 0.5 * np.log(2 * np.pi), axis=-1)
 
 
 def _is_one(log_ratio: np.ndarray) -> None:
@@ -87,7 +86,7 @@ def test_the_yaw_s_density_integrates_to_one_over_the_circle_and_its_draws_follo
 def test_the_flow_s_inverse_undoes_it_and_its_log_determinant_is_autodiff_s(dim: int):
     def build(key):
         leaves, tree = jax.tree.flatten(ConditionalFlow(dim, 3, 16, 4, key))
-        return tree.unflatten([a + 0.3 * jax.random.normal(key, a.shape) for a in leaves])
+        return jax.tree.unflatten(tree, [a + 0.3 * jax.random.normal(key, a.shape) for a in leaves])
 
     with jax.enable_x64(True):
         flow = eqx.filter_jit(build)(jax.random.key(7))
