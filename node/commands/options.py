@@ -301,16 +301,25 @@ class Capture:
 
 @dataclass(frozen=True)
 class Training:
-    """Train a prior on procedural tabletop objects, or on pictures of your own; resumes by itself after a stop."""
+    """Train a prior on procedural objects and on meshes, or on pictures of your own; resumes by itself after a stop."""
 
     out: Path = Path("runs/tabletop")
     """Folder of the run: checkpoint, history, curves.png and, in the end, prior.safetensors."""
-    preset: Literal["small", "paper", "tiny"] = "small"
-    """Sizes of the model: small for two CPU cores, the paper's, or tiny for a trial."""
+    preset: Literal["household", "small", "paper", "tiny"] = "small"
+    """Sizes of the model: small (vessels and cartons) or household (all kinds of things) for two CPU cores, the paper's, or
+    tiny for a trial."""
     start: Path | None = None
     """Initial weights, of the same preset; give --frozen-steps with it. Random by default."""
     objects: int = 40_000
-    """Training objects: the first seeds of the family."""
+    """Vessels and cartons: the first seeds of the tabletop family."""
+    household: int = 0
+    """Things of the household generator: its first seeds. This and --meshes need the extra packages of
+    `farside[meshes]`."""
+    meshes: tuple[Path, ...] = ()
+    """Folders of meshes to learn from (.glb, .gltf, .obj, .ply, .stl; metres; .glb has y up, the others z). One class of
+    names in ten is left for validation."""
+    variants: int = 8
+    """Variants of each mesh, stretched and in other resting poses; a household thing gets a quarter of them."""
     pictured: int = 4_000
     """How many of them, from the first, are also seen in pictures."""
     data: Path | None = None

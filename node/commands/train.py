@@ -28,8 +28,11 @@ from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering import foam
 from probnerf.training import elbo as training
 from probnerf.training.pictures import ViewSet, draw_views
+from probnerf.training.shape_set import ShapeSet, load_shapes
 from probnerf.training.srn_dataset import read_views
-from probnerf.training.surface_samples import Solids, draw_solids
+from probnerf.training.tabletop_shapes import tabletop_shapes
+
+TABLETOP_SHARE = 0.4  # of a batch, where there are other things; these share the rest by their numbers
 
 
 def train(options: Training, out: Console, err: Console) -> bool:
@@ -82,7 +85,9 @@ def train(options: Training, out: Console, err: Console) -> bool:
     return True
 
 
-def _material(options: Training, size: int, progress: Progress) -> tuple[Solids | None, ViewSet, dict[str, Any]]:
+def _material(
+    options: Training, size: int, progress: Progress
+) -> tuple[list[tuple[ShapeSet, float]], ViewSet, dict[str, Any]]:
     """The training data, and their description for the weights' metadata."""
 
     def advance(task: TaskID) -> Callable[[int, int], None]:
@@ -91,15 +96,66 @@ def _material(options: Training, size: int, progress: Progress) -> tuple[Solids 
     if options.data is not None:
         reading = progress.add_task("objects", total=None)
         views = read_views(options.data, size, options.pictures, advance(reading))
-        return None, views, {"family": "srn", "data": options.data.name, "objects": len(views.seeds)}
+        return [], views, {"family": "srn", "data": options.data.name, "objects": len(views.seeds)}
     sampling = progress.add_task("objects", total=options.objects)
     seeds = np.asarray(TRAIN_SEEDS[: options.objects])
-    solids = draw_solids(seeds, progress=advance(sampling))
+    tabletop = _kept(options.out / "shapes" / "tabletop.npz", lambda: tabletop_shapes(seeds, advance(sampling)))
+    others = _mesh_sets(options, progress, advance)
     pictured, pictures = min(options.pictured, options.objects), options.pictures or 8
     drawing = progress.add_task("pictures", total=pictured)
     views = draw_views(seeds[:pictured], pictures, size, progress=advance(drawing))
     seed_range = [TRAIN_SEEDS.start, TRAIN_SEEDS.start + options.objects]
-    return solids, views, {"family": "tabletop", "seeds": seed_range, "pictured": pictured, "pictures": pictures}
+    story = {"family": "tabletop", "seeds": seed_range, "pictured": pictured, "pictures": pictures}
+    if others:
+        story |= {"family": "household", "others": {name: len(each) for name, each in others.items()}}
+    share = TABLETOP_SHARE if others else 1.0
+    total = sum(len(each) for each in others.values())
+    sets = [(tabletop, share), *((each, (1.0 - share) * len(each) / total) for each in others.values())]
+    return sets, views, story
+
+
+def _mesh_sets(
+    options: Training, progress: Progress, advance: Callable[[TaskID], Callable[[int, int], None]]
+) -> dict[str, ShapeSet]:
+    """Shapes of the household generator and of every folder of meshes, by name; what was left out is printed."""
+    if not options.household and not options.meshes:
+        return {}
+    try:
+        from probnerf.training import mesh_shapes
+    except ModuleNotFoundError as error:
+        if error.name not in ("igl", "embreex", "manifold3d"):
+            raise
+        raise ValueError(f"meshes need the package {error.name}: pip install 'farside[meshes]'") from None
+    folder, found = options.out / "shapes", {}
+    if options.household:
+        task = progress.add_task("household", total=options.household)
+        found["household"] = _kept(
+            folder / "household.npz",
+            lambda: mesh_shapes.household_shapes(
+                TRAIN_SEEDS[: options.household], max(1, options.variants // 4), advance(task)
+            ),
+        )
+    for meshes in options.meshes:
+        task = progress.add_task(meshes.name, total=None)
+
+        def make(meshes: Path = meshes, task: TaskID = task) -> ShapeSet:
+            shapes, left_out = mesh_shapes.folder_shapes(meshes, options.variants, progress=advance(task))
+            for line in left_out:
+                progress.console.print(f"left out {line}", highlight=False, soft_wrap=True)
+            return shapes
+
+        found[meshes.name] = _kept(folder / f"{meshes.name}.npz", make)
+    return found
+
+
+def _kept(path: Path, make: Callable[[], ShapeSet]) -> ShapeSet:
+    """The set in this file, made where there is none."""
+    if path.exists():
+        return load_shapes(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shapes = make()
+    shapes.save(path)
+    return shapes
 
 
 def _revision() -> str:

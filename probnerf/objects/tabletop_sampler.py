@@ -114,7 +114,8 @@ def _handle(
     return np.stack([line_x, line_z], axis=-1), tube, across
 
 
-def _paint(rng: np.random.Generator) -> np.ndarray:
+def random_colour(rng: np.random.Generator) -> np.ndarray:
+    """A paint's colour in [0, 1]: white, dark or of any hue."""
     style = rng.uniform()
     if style < 0.2:
         return rng.uniform(0.82, 1.0) * rng.uniform(0.94, 1.0, 3)
@@ -123,10 +124,17 @@ def _paint(rng: np.random.Generator) -> np.ndarray:
     return np.array(colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(0.2, 0.95), rng.uniform(0.35, 1.0)))
 
 
+def random_light(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit vector towards a lamp, ambient light and the lamp's, each rgb."""
+    light = np.array([*rng.normal(size=2), rng.uniform(0.3, 2.0)])
+    ambient, lamp = rng.uniform(0.35, 0.75), rng.uniform(0.2, 0.65)
+    return light / np.linalg.norm(light), ambient * rng.uniform(0.95, 1.05, 3), lamp * rng.uniform(0.92, 1.08, 3)
+
+
 def _appearance(rng: np.random.Generator, kind: int, is_closed: bool) -> dict[str, np.ndarray | float]:
     """Paint, pattern and light."""
     texture = rng.choice(len(TEXTURES), p=_TEXTURE_WEIGHTS)
-    paint = np.stack([_paint(rng) for _ in range(7)])
+    paint = np.stack([random_colour(rng) for _ in range(7)])
     if rng.uniform() < 0.6 or texture == PRINTED:
         paint[5] = paint[0]
     if rng.uniform() < 0.5:

@@ -37,6 +37,7 @@ class Preset:
     radial: bool = False  # the field's input includes the distance from the body's axis
     fitted: bool = False  # the field first scales and shifts the points
     smooth: bool = False  # SiLU in the hypernetwork instead of the paper's ReLU
+    pairs: int = 2  # of couplings in the flow
 
     @property
     def field(self) -> MLPField:
@@ -55,6 +56,22 @@ PRESETS = {
     for preset in (
         Preset("paper", 128, 64, 10, 10, 512, 512, 128, 128, (32, 64, 128, 128, 128)),
         Preset("small", 48, 48, 6, 1, 128, 256, 32, 32, (24, 32, 48, 64, 128), radial=True, fitted=True, smooth=True),
+        Preset(
+            "household",
+            64,
+            48,
+            6,
+            1,
+            192,
+            512,
+            32,
+            32,
+            (24, 32, 48, 64, 128),
+            radial=True,
+            fitted=True,
+            smooth=True,
+            pairs=4,
+        ),
         Preset("tiny", 4, 8, 2, 1, 16, 16, 8, 16, (4, 4, 4, 4, 4)),  # for tests
     )
 }
@@ -270,7 +287,7 @@ class ProbNeRF(eqx.Module):
     def __init__(self, preset: Preset, key: PRNGKeyArray):
         k0, k1, k2 = jax.random.split(key, 3)
         self.preset = preset
-        self.flow = RealNVP(preset.latent, preset.flow_hidden, k0)
+        self.flow = RealNVP(preset.latent, preset.flow_hidden, k0, preset.pairs)
         self.hyper = HyperNetwork(preset.latent, preset.hyper_hidden, preset.field, preset.smooth, k1)
         self.encoder = Encoder(preset, k2)
 

@@ -13,7 +13,7 @@ density stays wide where a view is ambiguous. Without `solids` (None), training 
 and q(z) comes from the picture encoder.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,11 +24,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from probnerf.likelihood.dispatch import map_with_gradient, weighted_terms
 from probnerf.likelihood.settings import Likelihood
-from probnerf.objects.tabletop import description, sample_object
 from probnerf.prior.encoder_input import camera_features, encoder_image
 from probnerf.prior.networks import ProbNeRF, Recognition
 from probnerf.rendering import foam
@@ -36,8 +35,11 @@ from probnerf.training.batches import Batch, draw_batch, strata_of
 from probnerf.training.pictures import ViewSet
 from probnerf.training.run_folder import RunFolder
 from probnerf.training.settings import TrainConfig
-from probnerf.training.surface_samples import Solids, colour_samples, shape_samples
+from probnerf.training.shape_set import DESCRIPTION, ShapeBatch, ShapeSet, batch_of, draw_shapes
 from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
+
+
+BEHIND = 0.04  # cube units; a lattice of 32 can have a face this far behind a surface, so it needs colours there
 
 
 def encode(model: ProbNeRF, batch: Batch) -> tuple[Float[Array, "b k"], Float[Array, "b k"]]:
@@ -64,6 +66,16 @@ def encoder_loss(model: ProbNeRF, batch: Batch, z: Float[Array, "b k"]) -> Float
     mean, precision = encode(model, batch)
     z = jax.lax.stop_gradient(z)
     return -0.5 * jnp.mean(jnp.sum(jnp.log(precision) - precision * (z - mean) ** 2, axis=-1))
+
+
+def colour_samples(solids: ShapeBatch, key: PRNGKeyArray) -> tuple[Float[Array, "b m 3"], Float[Array, "b m 3"]]:
+    """Points slightly behind the surface, and directions from which a camera may see them."""
+    k0, k1 = jax.random.split(key)
+    normal = jnp.asarray(solids.normal)
+    points = solids.surface - BEHIND * jax.random.uniform(k0, (*normal.shape[:2], 1)) * normal
+    view = jax.random.normal(k1, normal.shape)
+    view /= jnp.maximum(jnp.linalg.norm(view, axis=-1, keepdims=True), 1e-6)
+    return points, jnp.where(jnp.sum(view * normal, axis=-1, keepdims=True) > 0.0, -view, view)
 
 
 def _solid_terms(shared: tuple, item: tuple, weights: Array) -> Float[Array, ""]:
@@ -135,7 +147,7 @@ def _to_view(pose: Pose, p: Array) -> Array:
 
 def loss(
     networks: tuple[ProbNeRF, Recognition],
-    solids: Solids | None,
+    solids: ShapeBatch | None,
     batch: Batch | None,
     key: Array,
     kl_weight: Array,
@@ -148,18 +160,19 @@ def loss(
     are used.
     """
     model, recognition = networks
-    k0, k1, k2 = jax.random.split(key, 3)
+    k0, k1 = jax.random.split(key)
     if solids is None:
         assert batch is not None, "neither solids nor rays"
         mean, precision = encode(model, batch)
     else:
-        mean, precision = jax.vmap(lambda o: recognition(description(o)))(solids.objects)
+        mean, precision = jax.vmap(recognition)(solids.description)
     z = mean + jax.random.normal(k0, mean.shape) / jnp.sqrt(precision)
     kl = jnp.mean(jax.vmap(kl_estimate, in_axes=(None, 0, 0, 0))(model, z, mean, precision))
     weights = jax.vmap(model.hyper)(z)
     each: tuple | None = None
     if solids is not None:
-        each = (*shape_samples(solids, k1, config.points), *colour_samples(solids, k2, config.colours))
+        each = (solids.points, solids.inside, *colour_samples(solids, k1), solids.rgb, solids.valid)
+        each = jax.tree.map(jnp.asarray, each)
     terms, encoder = _solid_terms, jnp.zeros(())
     if batch is not None:
         drawn = (batch.origin, batch.direction, batch.ray_rgb, batch.ray_range, batch.ray_weight, batch.turn)
@@ -197,8 +210,15 @@ def optimiser_of(config: TrainConfig) -> optax.GradientTransformation:
         first = min(config.solid_steps, config.steps)
         still = min(frozen, first)
         parts = [
-            optax.warmup_cosine_decay_schedule(
-                0.0, peak, min(config.warmup, steps // 4), max(steps, 1), config.final_learning_rate
+            optax.join_schedules(
+                [
+                    optax.linear_schedule(0.0, peak, warm := min(config.warmup, steps // 4)),
+                    optax.constant_schedule(peak),
+                    optax.cosine_decay_schedule(
+                        peak, max(steps - int(config.level * steps), 1), config.final_learning_rate / peak
+                    ),
+                ],
+                [warm, int(config.level * steps)],
             )
             for peak, steps in ((solid, first - still), (ray, config.steps - first))
         ]
@@ -222,16 +242,15 @@ def optimiser_of(config: TrainConfig) -> optax.GradientTransformation:
 
 def initial_state(model: ProbNeRF, config: TrainConfig) -> TrainState:
     """The state of a new run."""
-    size = description(sample_object(0)).shape[0]
     key = jax.random.fold_in(jax.random.key(config.seed), 1)
-    recognition = Recognition(size, model.latent, model.preset.hyper_hidden, key)
+    recognition = Recognition(DESCRIPTION, model.latent, model.preset.hyper_hidden, key)
     optimiser = optimiser_of(config).init((model, recognition))
     return TrainState(model, recognition, optimiser, jnp.zeros((), jnp.int32))
 
 
 @eqx.filter_jit(donate="all-except-first")
 def train_step(
-    static: tuple[Likelihood, TrainConfig], state: TrainState, solids: Solids | None, batch: Batch | None
+    static: tuple[Likelihood, TrainConfig], state: TrainState, solids: ShapeBatch | None, batch: Batch | None
 ) -> tuple[TrainState, dict[str, Array]]:
     """One update. Without `batch`, it is a step of the solid phase."""
     likelihood, config = static
@@ -246,14 +265,20 @@ def train_step(
 
 
 def train(
-    model: ProbNeRF, solids: Solids | None, views: ViewSet, likelihood: Likelihood, config: TrainConfig, folder: Path
+    model: ProbNeRF,
+    solids: Sequence[tuple[ShapeSet, float]],
+    views: ViewSet,
+    likelihood: Likelihood,
+    config: TrainConfig,
+    folder: Path,
 ) -> Iterator[tuple[TrainState, dict[str, float]]]:
     """Run or resume in `folder`; yields (state, metrics) every `log_every` steps and appends them to history.jsonl.
 
-    `views` are pictures of the first objects of `solids`. If `solids` is None, there is no solid phase, and training
-    uses only pictures. Raises FloatingPointError with the step if the loss is not finite. The last checkpoint is kept.
+    `solids` are sets of shapes and their shares of each batch; `views` are pictures of the first set's first objects.
+    Without solids, there is no solid phase, and training uses only pictures. Raises FloatingPointError with the step if
+    the loss is not finite. The last checkpoint is kept.
     """
-    if solids is None and config.solid_steps:
+    if not solids and config.solid_steps:
         raise ValueError(f"solid_steps is {config.solid_steps}; it must be 0 where there are pictures alone")
     if config.steps > config.solid_steps and views.rgb.shape[1] < config.views:
         raise ValueError(f"--views is {config.views} but objects have {views.rgb.shape[1]} pictures; give no more")
@@ -263,12 +288,14 @@ def train(
     strata = strata_of(views)
     start = int(state.step)
 
-    def data_of(step: int) -> tuple[Solids | None, Batch | None]:
-        if solids is None or step >= config.solid_steps:
-            batch = draw_batch(views, strata, config, step, config.ray_batch)
-            return None if solids is None else solids[np.asarray(batch.rows)], batch
-        rng = np.random.default_rng([config.seed, step, 3])
-        return solids[rng.choice(len(solids.point), config.batch, replace=False)], None
+    def data_of(step: int) -> tuple[ShapeBatch | None, Batch | None]:
+        rng = np.random.default_rng([config.seed, step, 7])
+        if step < config.solid_steps:
+            return draw_shapes(solids, rng, config.batch, config.points, config.colours), None
+        batch = draw_batch(views, strata, config, step, config.ray_batch)
+        if not solids:
+            return None, batch
+        return batch_of(solids[0][0], rng, np.asarray(batch.rows), config.points, config.colours), batch
 
     with ThreadPoolExecutor(1) as drawer:  # the next batch is drawn while this one is used
         coming = drawer.submit(data_of, start)

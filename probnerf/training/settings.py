@@ -26,6 +26,7 @@ class TrainConfig:
     ray_learning_rate: float = 3e-4  # in the ray phase, of all networks except the encoder
     final_learning_rate: float = 2e-5
     warmup: int = 500
+    level: float = 0.6  # share of a phase's steps after which its learning rate falls (by a half cosine)
     frozen_steps: int = 0  # first steps with a frozen decoder, to adapt recognition to an already trained one
     kl_warmup: int = 2_000
     seed: int = 0

@@ -16,7 +16,6 @@ from probnerf.prior.checkpoint import load_prior
 from probnerf.training.pictures import ViewSet
 from probnerf.training.settings import TrainConfig
 from probnerf.training.srn_dataset import NO_RANGE, Instance, write_instance
-from probnerf.training.surface_samples import Solids
 
 
 @dataclass
@@ -35,7 +34,7 @@ class Trainer:
         self.asked: dict[str, Any] = {}
 
     def __call__(
-        self, model: Any, solids: Solids | None, views: ViewSet, likelihood: Any, config: TrainConfig, folder: Path
+        self, model: Any, solids: Any, views: ViewSet, likelihood: Any, config: TrainConfig, folder: Path
     ) -> Iterator:
         self.asked = {"model": model, "solids": solids, "views": views, "config": config, "likelihood": likelihood}
         folder.mkdir(parents=True, exist_ok=True)
@@ -69,7 +68,7 @@ def test_the_recipe_is_handed_over_and_the_weights_exported(
     assert trainer.asked["config"] == TrainConfig(steps=10, seed=4)
     views = trainer.asked["views"]
     assert np.array_equal(views.seeds, [0, 1, 2]) and views.rgb.shape == (3, 2, 16, 16, 3)
-    assert len(trainer.asked["solids"].point) == 3
+    assert [len(shapes) for shapes, _ in trainer.asked["solids"]] == [3]
     prior = load_prior(folder / "prior.safetensors", preset="tiny")
     assert prior.metadata["seeds"] == [0, 3] and prior.metadata["steps"] == 10
     assert prior.metadata["recipe"]["seed"] == 4 and prior.metadata["revision"]
@@ -103,7 +102,7 @@ def test_pictures_of_ones_own_take_the_place_of_procedural_objects(
         write_instance(tmp_path / "data", Instance(name, 12.0, (8.0, 8.0), (0.0, 0.0, 0.0), 1.0, rgb, mask, T))
     folder, more = tmp_path / "run", ["--preset", "tiny", "--steps", "10", "--learning-rate", "0.01"]
     assert main(["train", "--data", str(tmp_path / "data"), "--out", str(folder), *more]) == 0
-    assert trainer.asked["solids"] is None
+    assert trainer.asked["solids"] == []
     config = TrainConfig(steps=10, learning_rate=0.01, ray_learning_rate=0.01, solid_steps=0)
     assert trainer.asked["config"] == config
     views = trainer.asked["views"]
