@@ -105,11 +105,11 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "tyro": ("node/__main__.py", "node/commands/options.py", "benchmarks/*", "examples/*"),
     "trimesh": (
         "perception/answers/regions.py",
-        "probnerf/objects/household.py",
-        "benchmarks/scenes/meshes.py",
-        "benchmarks/scenes/strangers.py",
-    ),
-    "igl": ("benchmarks/scenes/strangers.py",),  # generalised winding numbers
+        "probnerf/objects/*",
+        "probnerf/training/mesh_shapes.py",
+        "benchmarks/scenes/*",
+    ),  # fmt: skip
+    "igl": ("probnerf/objects/mesh.py", "benchmarks/scenes/strangers.py"),  # generalised winding numbers
     "embreex": ("perception/simulation/ray_caster.py",),  # the extra `meshes`, imported where it is needed
     "manifold3d": ("probnerf/objects/household_parts.py",),  # the same extra: exact booleans of solids
     "rich": ("node/*", "benchmarks/*"),

@@ -301,13 +301,13 @@ class Capture:
 
 @dataclass(frozen=True)
 class Training:
-    """Train a prior on procedural objects and on meshes, or on pictures of your own; resumes by itself after a stop."""
+    """Train a prior on procedural objects and meshes, or on pictures of your own; resumes by itself after a stop."""
 
     out: Path = Path("runs/tabletop")
     """Folder of the run: checkpoint, history, curves.png and, in the end, prior.safetensors."""
     preset: Literal["household", "small", "paper", "tiny"] = "small"
-    """Sizes of the model: small (vessels and cartons) or household (all kinds of things) for two CPU cores, the paper's, or
-    tiny for a trial."""
+    """Sizes of the model: small (vessels and cartons) and household (all kinds of things), both for two cores; the paper's;
+    or tiny, for a trial."""
     start: Path | None = None
     """Initial weights, of the same preset; give --frozen-steps with it. Random by default."""
     objects: int = 40_000
@@ -316,8 +316,8 @@ class Training:
     """Things of the household generator: its first seeds. This and --meshes need the extra packages of
     `farside[meshes]`."""
     meshes: tuple[Path, ...] = ()
-    """Folders of meshes to learn from (.glb, .gltf, .obj, .ply, .stl; metres; .glb has y up, the others z). One class of
-    names in ten is left for validation."""
+    """Folders of meshes to learn from (.glb, .gltf, .obj, .ply, .stl; metres; y is up in .glb and .gltf, z in the
+    others). One class of names in ten is left for validation."""
     variants: int = 8
     """Variants of each mesh, stretched and in other resting poses; a household thing gets a quarter of them."""
     pictured: int = 4_000

@@ -4,6 +4,7 @@ import json
 import subprocess
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -120,12 +121,11 @@ def _mesh_sets(
     """Shapes of the household generator and of every folder of meshes, by name; what was left out is printed."""
     if not options.household and not options.meshes:
         return {}
-    try:
-        from probnerf.training import mesh_shapes
-    except ModuleNotFoundError as error:
-        if error.name not in ("igl", "embreex", "manifold3d"):
-            raise
-        raise ValueError(f"meshes need the package {error.name}: pip install 'farside[meshes]'") from None
+    for library in ("igl", "embreex", "manifold3d"):
+        if find_spec(library) is None:
+            raise ValueError(f"meshes need the package {library}: pip install 'farside[meshes]'")
+    from probnerf.training import mesh_shapes  # only here: it needs them
+
     folder, found = options.out / "shapes", {}
     if options.household:
         task = progress.add_task("household", total=options.household)

@@ -38,7 +38,6 @@ from probnerf.training.settings import TrainConfig
 from probnerf.training.shape_set import DESCRIPTION, ShapeBatch, ShapeSet, batch_of, draw_shapes
 from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
 
-
 BEHIND = 0.04  # cube units; a lattice of 32 can have a face this far behind a surface, so it needs colours there
 
 

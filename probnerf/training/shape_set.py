@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.spatial import cKDTree
 
 from foundation.whole_file import whole_file
 
@@ -83,7 +82,8 @@ def in_cube(units: np.ndarray) -> np.ndarray:
 
 def nearest(surface: Float[np.ndarray, "n 3"]) -> np.ndarray:
     """The surface point nearest to the centre of each of ANCHORS^3 cells."""
-    return cKDTree(surface).query(0.75 * centres(ANCHORS))[1].astype(np.int16)
+    gap = 0.75 * centres(ANCHORS)[:, None] - surface[None]
+    return np.argmin(np.einsum("asi,asi->as", gap, gap), axis=1).astype(np.int16)
 
 
 class ShapeBatch(eqx.Module):
