@@ -103,12 +103,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "websockets": ("node/viewer/page_guard.py",),  # viser's server
     "xxhash": ("node/ros/rmw_zenoh.py",),
     "tyro": ("node/__main__.py", "node/commands/options.py", "benchmarks/*", "examples/*"),
-    "trimesh": (
-        "perception/answers/regions.py",
-        "probnerf/objects/*",
-        "probnerf/training/mesh_shapes.py",
-        "benchmarks/scenes/*",
-    ),  # fmt: skip
+    "trimesh": ("perception/answers/regions.py", "probnerf/objects/*", "probnerf/training/*", "benchmarks/scenes/*"),
     "igl": ("probnerf/objects/mesh.py", "benchmarks/scenes/strangers.py"),  # generalised winding numbers
     "embreex": ("perception/simulation/ray_caster.py",),  # the extra `meshes`, imported where it is needed
     "manifold3d": ("probnerf/objects/household_parts.py",),  # the same extra: exact booleans of solids
