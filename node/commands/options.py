@@ -306,8 +306,8 @@ class Training:
     out: Path = Path("runs/tabletop")
     """Folder of the run: checkpoint, history, curves.png and, in the end, prior.safetensors."""
     preset: Literal["household", "small", "paper", "tiny"] = "small"
-    """Sizes of the model: small (vessels and cartons) and household (all kinds of things), both for two cores; the paper's;
-    or tiny, for a trial."""
+    """Sizes of the model: small (vessels and cartons), household (all kinds of things), the paper's, or tiny for a
+    trial."""
     start: Path | None = None
     """Initial weights, of the same preset; give --frozen-steps with it. Random by default."""
     objects: int = 40_000
