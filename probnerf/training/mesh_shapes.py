@@ -100,6 +100,11 @@ def placed(thing: MeshObject, rng: np.random.Generator) -> MeshObject:
     return replace(thing, vertices=vertices, half_extent=thing.half_extent / scale)
 
 
+def paint_of(seed: int, index: int) -> Paint:
+    """One of the paints in which an object of this seed is learnt."""
+    return draw_paint(np.random.default_rng([seed, 53, index]))
+
+
 def sample_mesh(thing: MeshObject, seed: int, paints: int = PAINTS) -> ShapeSet:
     """A set of one object (placed already), with paints drawn from the seed."""
     rng = np.random.default_rng([seed, 41])
@@ -110,7 +115,7 @@ def sample_mesh(thing: MeshObject, seed: int, paints: int = PAINTS) -> ShapeSet:
     points = as_units(np.concatenate([near, rng.uniform(-1.0, 1.0, (ANYWHERE, 3))]))
     grid = centres(GRID)
     distance = thing.signed_distance(np.concatenate([grid, in_cube(points)]))
-    drawn = [draw_paint(rng) for _ in range(paints)]
+    drawn = [paint_of(seed, i) for i in range(paints)]
     rgb = np.stack([paint.rgb(surface, normal) for paint in drawn])
     return ShapeSet(
         distance=np.clip(distance[: len(grid)], -CLIP, CLIP).astype(np.float16)[None],
