@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 _LOOKS_DOWN = np.radians(8.0)  # least angle at which a top's far side can be distinguished from its near side
+_PROTRUDES = 1.36  # half widths from the axis: the prior's handles and spouts end here (`tabletop_sampler.REACH_LIMIT`)
 
 
 def visible_body(
@@ -15,6 +16,9 @@ def visible_body(
     medians over chords pass over handles and spouts. Where it does not, only the near side is seen, and the axis is
     half a width behind it, as in a body of revolution. A side that borders on something `hidden` is not the body's end:
     then the axis is half a width, taken from the top's depth, from the other side.
+
+    Where more than a handle or spout protrudes (a hammer's shaft, a pan's handle, an animal's body behind its head), there
+    is no such body: then centre and width are of all that is seen.
     """
     x, y, z = seen.T
     height = float(np.percentile(z, 99))
@@ -39,7 +43,21 @@ def visible_body(
     if (low_cut.mean() > 0.4) != (high_cut.mean() > 0.4):
         at_high = high_cut.mean() > 0.4
         centre_y = float(np.percentile(low, 30)) + width / 2 if at_high else float(np.percentile(high, 70)) - width / 2
-    return np.array([centre_x, centre_y]), width, height, top_seen
+    centre, across = np.array([centre_x, centre_y]), seen[:, :2]
+    reach = float(np.percentile(np.linalg.norm(across - centre, axis=1), 98))
+    if reach > _PROTRUDES * max(width, height) / 2:
+        centre, width = _whole_extent(across)
+    return centre, width, height, top_seen
+
+
+def _whole_extent(across: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], float]:
+    """Middle and longest side of the smallest of the rectangles about the points (1% left out at each end)."""
+    angle = np.radians(np.arange(0.0, 90.0, 5.0))
+    axes = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    axes = np.stack([axes, axes[:, ::-1] * [-1.0, 1.0]], axis=1)  # [angle, axis, 2]
+    low, high = np.percentile(across @ np.swapaxes(axes, 1, 2), [1, 99], axis=1)  # [angle, axis]
+    best = int(np.argmin(np.prod(high - low, axis=1)))
+    return ((low + high)[best] / 2) @ axes[best], float((high - low)[best].max())
 
 
 def _extents(
