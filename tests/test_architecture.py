@@ -88,7 +88,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
         "perception/*",
         "benchmarks/*",
     ),
-    "skimage": ("probnerf/rendering/occupancy.py", "perception/*"),
+    "skimage": ("probnerf/rendering/occupancy.py", "probnerf/training/learnt_objects.py", "perception/*"),
     "serial": ("calibration/turntable.py",),
     "depthai": ("perception/sources/oak.py",),
     # recorded logs; messages on the bus

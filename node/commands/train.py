@@ -81,7 +81,7 @@ def train(options: Training, out: Console, err: Console) -> bool:
         "start": None if begun is None else {"hash": begun.hash, **begun.metadata},
         "gate": None,
     }
-    save_prior(weights, state.model, story)
+    save_prior(weights, state.model, story, half=preset.name == "household")
     out.print(f"{weights}; judge it with `farside bench prior --prior {weights}`", highlight=False, soft_wrap=True)
     return True
 

@@ -17,8 +17,8 @@ def visible_body(
     half a width behind it, as in a body of revolution. A side that borders on something `hidden` is not the body's end:
     then the axis is half a width, taken from the top's depth, from the other side.
 
-    Where more than a handle or spout protrudes (a hammer's shaft, a pan's handle, an animal's body behind its head), there
-    is no such body: then centre and width are of all that is seen.
+    Where more than a handle or spout protrudes (a hammer's shaft, a pan's handle, an animal's body behind its head),
+    there is no such body: then centre and width are of all that is seen.
     """
     x, y, z = seen.T
     height = float(np.percentile(z, 99))

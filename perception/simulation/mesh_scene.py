@@ -29,6 +29,7 @@ class MeshShape:
     half_extent: float  # m per cube unit
     paint: Paint | Float[np.ndarray, "f 3"] | Float[np.ndarray, "3"] | tuple[float, float, float]  # or colour of faces
     gloss: float = 0.0  # in [0, 1]; highlights for the eye, glare for the sensor
+    lit: bool = False  # the colours are lit already: the scene's lamp adds nothing to them
 
     @cached_property
     def reach(self) -> float:
@@ -188,7 +189,7 @@ def _shoot(
         own = placed.shape.colour(hits.face[at], placed.to_cube(points[at]), normal @ R)
         lit = ~scene.caster.shaded(points[at], normal, light)
         direct = (1.0 - ambient) * lit * np.clip(normal @ light, 0.0, 1.0)
-        rgb[at] = own * (ambient + direct)[:, None]
+        rgb[at] = own if placed.shape.lit else own * (ambient + direct)[:, None]
         if placed.shape.gloss:
             halfway = light - directions[at]
             halfway /= np.linalg.norm(halfway, axis=1, keepdims=True)

@@ -45,9 +45,13 @@ def _named(model: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in leaves}
 
 
-def save_prior(path: Path, model: ProbNeRF, metadata: dict[str, Any]) -> None:
-    """Write atomically. `metadata` must be JSON-serialisable."""
+def save_prior(path: Path, model: ProbNeRF, metadata: dict[str, Any], half: bool = False) -> None:
+    """Write atomically; with `half` in half precision. `metadata` must be JSON-serialisable.
+
+    Raises ValueError if a weight is not finite in half precision.
+    """
     arrays = {name: np.ascontiguousarray(leaf) for name, leaf in _named(model).items()}
+    arrays = _halved(arrays, path) if half else arrays
     story = {"format": FORMAT, "preset": model.preset.name, **metadata}
     write_whole(path, save(arrays, metadata={"farside": json.dumps(story, sort_keys=True)}))
 
@@ -77,11 +81,7 @@ def save_posterior_network(path: Path, network: PosteriorNetwork, prior: str, me
 
     `metadata` must be JSON-serialisable. Raises ValueError if a weight is not finite in half precision.
     """
-    with np.errstate(over="ignore"):
-        arrays = {name: np.ascontiguousarray(leaf, np.float16) for name, leaf in _named(network).items()}
-    for name, array in arrays.items():
-        if not np.isfinite(array).all():
-            raise ValueError(f"{path}: array {name} is not finite in half precision; nothing was written")
+    arrays = _halved({name: np.asarray(leaf) for name, leaf in _named(network).items()}, path)
     story = {"format": NETWORK_FORMAT, "sizes": asdict(network.sizes), "prior": prior, **metadata}
     write_whole(path, save(arrays, metadata={"farside": json.dumps(story, sort_keys=True)}))
 
@@ -106,8 +106,17 @@ def load_posterior_network(path: Path, prior: Prior) -> TrainedNetwork:
     if sizes.latent != prior.model.latent:
         raise ValueError(f"{path} has {sizes.latent} latents, the prior has {prior.model.latent}; train it again")
     network = jax.eval_shape(lambda key: PosteriorNetwork(sizes, key), jax.random.key(0))
-    arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
     return TrainedNetwork(_filled(network, arrays, path, "this architecture"), story, _hash(path))
+
+
+def _halved(arrays: dict[str, np.ndarray], path: Path) -> dict[str, np.ndarray]:
+    """The same in half precision."""
+    with np.errstate(over="ignore"):
+        halves = {name: np.ascontiguousarray(array, np.float16) for name, array in arrays.items()}
+    for name, array in halves.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"{path}: array {name} is not finite in half precision; nothing was written")
+    return halves
 
 
 def _read(path: Path, what: str, remedy: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -128,7 +137,8 @@ def _filled(model: M, arrays: dict[str, np.ndarray], path: Path, owner: str) -> 
         if found is None or found.shape != leaf.shape:
             shape = "missing" if found is None else f"of shape {list(found.shape)}"
             raise ValueError(f"{path}: array {name} is {shape}, {owner} needs {list(leaf.shape)}; train it again")
-    leaves = jax.device_put([arrays[name] for name in named])
+    # a file in half precision is read in the model's own
+    leaves = jax.device_put([arrays[name].astype(leaf.dtype, copy=False) for name, leaf in named.items()])
     return jax.tree.unflatten(jax.tree.structure(model), leaves)
 
 

@@ -122,10 +122,19 @@ def draw_shapes(
     return jax.tree.map(lambda *a: np.concatenate(a), *parts)
 
 
-def batch_of(shapes: ShapeSet, rng: np.random.Generator, rows: np.ndarray, points: int, colours: int) -> ShapeBatch:
-    """A batch of these objects in any of their paints. Three quarters of the points are near the surface."""
+def batch_of(
+    shapes: ShapeSet,
+    rng: np.random.Generator,
+    rows: np.ndarray,
+    points: int,
+    colours: int,
+    paint: np.ndarray | None = None,
+) -> ShapeBatch:
+    """A batch of these objects, each in any of its paints (or in this one). Three quarters of the points are near the
+    surface.
+    """
     size, near = len(rows), 3 * points // 4
-    paint = rng.integers(0, shapes.rgb.shape[1], size)
+    paint = rng.integers(0, shapes.rgb.shape[1], size) if paint is None else paint
     each = np.arange(size)[:, None]
     at = rows[:, None]
     point = np.concatenate(

@@ -22,7 +22,7 @@ def guessed(points: np.ndarray, angle: float) -> tuple[np.ndarray, float]:
     turn = np.array([[c, -s], [s, c]])
     seen = np.column_stack([points[:, :2] @ turn.T - [0.5, 0.0], points[:, 2]])
     centre, width, _, _ = visible_body(seen, np.zeros(len(seen), bool), CAMERA)
-    return (centre + [0.5, 0.0]) @ turn, width
+    return (centre + np.array([0.5, 0.0])) @ turn, width
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.6, 1.3, 2.2])

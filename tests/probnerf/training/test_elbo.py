@@ -154,6 +154,12 @@ def test_a_prior_survives_its_file(tmp_path: Path) -> None:
     assert loaded.metadata["family"] == "tabletop"
     for a, b in zip(jax.tree.leaves(saved), jax.tree.leaves(loaded.model), strict=True):
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+    save_prior(tmp_path / "half.safetensors", saved, {}, half=True)
+    for a, b in zip(
+        jax.tree.leaves(saved), jax.tree.leaves(load_prior(tmp_path / "half.safetensors").model), strict=True
+    ):
+        assert b.dtype == a.dtype
+        np.testing.assert_allclose(np.asarray(a), np.asarray(b), rtol=1e-3, atol=1e-6)
     with pytest.raises(ValueError, match="holds preset 'tiny', not 'small'"):
         load_prior(tmp_path / "p.safetensors", preset="small")
     (tmp_path / "cut.safetensors").write_bytes((tmp_path / "p.safetensors").read_bytes()[:200])

@@ -1,0 +1,94 @@
+"""Pictures to train the posterior network on: random objects on simulated tables, as perception sees them.
+
+They are drawn in parts, each a file that depends on its number alone, so that drawing can stop and go on. They do not
+depend on the prior: a part holds each object's description, from which the prior's recognition tells its latents.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from foundation.whole_file import whole_file
+from perception.simulation.examples import Example, ExampleDraws, draw_example
+from perception.simulation.mesh_scene import MeshShape
+from perception.simulation.view_draws import ViewDraws
+from probnerf.training.learnt_objects import Families, LearntObject, draw_objects
+
+
+@dataclass(frozen=True, eq=False)
+class PicturePart:
+    """N pictures of M objects; as `PictureSet`, with descriptions in the place of latents."""
+
+    rgb: np.ndarray  # u8 [N, S, S, 3]
+    distance: np.ndarray  # f16 [N, S, S]
+    unknown: np.ndarray  # u8 [N, S, S]
+    T_view_camera: np.ndarray  # f32 [N, 4, 4]
+    tan_half_fov: np.ndarray  # f32 [N]
+    pose_sigma: np.ndarray  # f32 [N, 5]
+    yaw: np.ndarray  # f32 [N]
+    pose: np.ndarray  # f32 [N, 4]
+    row: np.ndarray  # i32 [N], of the object
+    description: np.ndarray  # f16 [M, d]
+    kind: np.ndarray  # u8 [M]
+    family: np.ndarray  # u8 [M]
+    seed: np.ndarray  # i64 [M]
+
+    def save(self, path: Path) -> None:
+        """Write atomically."""
+        with whole_file(path) as part, part.open("wb") as file:
+            np.savez_compressed(file, **{f.name: getattr(self, f.name) for f in fields(self)})
+
+    @classmethod
+    def load(cls, path: Path) -> "PicturePart":
+        with np.load(path, allow_pickle=False) as file:
+            return cls(**{f.name: file[f.name] for f in fields(cls)})
+
+
+def draw_part(
+    number: int,
+    families: Families,
+    objects: int,
+    views: int,
+    size: int,
+    draws: ExampleDraws | None = None,
+    looks: ViewDraws | None = None,
+) -> tuple[PicturePart, Counter[str]]:
+    """One part: so many views of each of its objects, less those that perception refuses, and its reasons."""
+    rng = np.random.default_rng([number, 71])
+    things = draw_objects(rng, objects, families)
+    shapes = [MeshShape(t.vertices, t.faces, t.half_extent, t.colours, lit=True) for t in things]
+    examples, rows, reasons = [], [], Counter[str]()
+    for row, shape in enumerate(shapes):
+        for _ in range(views):
+            found = draw_example(rng, shape, shapes, size, draws, looks)
+            if isinstance(found, Example):
+                examples.append(found)
+                rows.append(row)
+            else:
+                reasons[found] += 1
+    return _part(examples, np.array(rows, np.int32), things), reasons
+
+
+def _part(examples: list[Example], rows: np.ndarray, things: list[LearntObject]) -> PicturePart:
+    def stacked(name: str, kind: type) -> np.ndarray:
+        return np.stack([np.asarray(getattr(e.picture, name)) for e in examples]).astype(kind)
+
+    pose: Float[np.ndarray, "n 7"] = np.stack([e.pose for e in examples])
+    return PicturePart(
+        rgb=np.round(255.0 * stacked("rgb", np.float32)).astype(np.uint8),
+        distance=stacked("distance", np.float16),
+        unknown=stacked("unknown", np.uint8),
+        T_view_camera=stacked("T_view_camera", np.float32),
+        tan_half_fov=stacked("tan_half_fov", np.float32),
+        pose_sigma=np.stack([e.pose_sigma for e in examples]).astype(np.float32),
+        yaw=np.arctan2(pose[:, 1], pose[:, 0]).astype(np.float32),
+        pose=pose[:, [2, 3, 4, 6]].astype(np.float32),
+        row=rows,
+        description=np.stack([t.description for t in things]).astype(np.float16),
+        kind=np.array([t.kind for t in things], np.uint8),
+        family=np.array([t.family for t in things], np.uint8),
+        seed=np.array([t.seed for t in things], np.int64),
+    )

@@ -1,0 +1,53 @@
+"""Training pictures show the object that their description tells, where their pose says."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.interpolate import RegularGridInterpolator
+
+for library in ("igl", "embreex", "manifold3d"):
+    pytest.importorskip(library)
+
+from perception.simulation.examples import ExampleDraws  # noqa: E402
+from perception.simulation.training_pictures import PicturePart, draw_part  # noqa: E402
+from perception.simulation.view_draws import ViewDraws  # noqa: E402
+from probnerf.geometry import pinhole_rays  # noqa: E402
+from probnerf.training.learnt_objects import HOUSEHOLD, TABLETOP, Families  # noqa: E402
+from probnerf.training.shape_set import CLIP, DESCRIPTION, GRID  # noqa: E402
+from probnerf.types import Pose  # noqa: E402
+
+PLAIN = ExampleDraws(no_depth=0.0, own_mask=0.0, wrong_plane=0.0, pose_known=0.0)
+FREE = ViewDraws(beside=0.0, before=0.0, border=0.0)
+
+
+@pytest.fixture(scope="module")
+def part() -> PicturePart:
+    families = Families(tabletop=range(8), tabletop_share=0.5, household=range(8), household_variants=2)
+    return draw_part(3, families, 4, 2, 32, PLAIN, FREE)[0]
+
+
+@pytest.mark.slow
+def test_what_is_seen_lies_on_the_described_surface(part: PicturePart) -> None:
+    assert set(part.family) == {TABLETOP, HOUSEHOLD} and part.description.shape == (4, DESCRIPTION)
+    at, misses = (np.arange(GRID) + 0.5) * (2.0 / GRID) - 1.0, []
+    for i, row in enumerate(part.row):
+        origin, direction = pinhole_rays(part.T_view_camera[i].astype(float), 16 / part.tan_half_fov[i], 32)
+        length = part.distance[i].astype(float).ravel()
+        seen = (length > 0) & (part.unknown[i].ravel() == 0)
+        x, y, log_scale, z = part.pose[i] * part.pose_sigma[i][[0, 1, 2, 4]]
+        pose = Pose(yaw=part.yaw[i], x=x, y=y, log_scale=log_scale, z=z)
+        points = np.asarray(pose.to_object(origin[seen] + length[seen, None] * direction[seen]))
+        grid = CLIP * part.description[row, : GRID**3].astype(float).reshape(GRID, GRID, GRID)
+        distance = RegularGridInterpolator((at,) * 3, grid, bounds_error=False)(points)
+        misses.append(np.nanmedian(np.abs(distance)))
+    assert np.median(misses) < 0.05  # half a cell of the grid
+    assert np.max(misses) < 0.15  # a sensor's bias, of a small object
+
+
+@pytest.mark.slow
+def test_a_part_survives_its_file(part: PicturePart, tmp_path: Path) -> None:
+    part.save(tmp_path / "a.npz")
+    again = PicturePart.load(tmp_path / "a.npz")
+    np.testing.assert_array_equal(again.distance, part.distance)
+    np.testing.assert_array_equal(again.description, part.description)
