@@ -71,7 +71,7 @@ def colour_samples(solids: ShapeBatch, key: PRNGKeyArray) -> tuple[Float[Array, 
     """Points slightly behind the surface, and directions from which a camera may see them."""
     k0, k1 = jax.random.split(key)
     normal = jnp.asarray(solids.normal)
-    points = solids.surface - BEHIND * jax.random.uniform(k0, (*normal.shape[:2], 1)) * normal
+    points = jnp.asarray(solids.surface) - BEHIND * jax.random.uniform(k0, (*normal.shape[:2], 1)) * normal
     view = jax.random.normal(k1, normal.shape)
     view /= jnp.maximum(jnp.linalg.norm(view, axis=-1, keepdims=True), 1e-6)
     return points, jnp.where(jnp.sum(view * normal, axis=-1, keepdims=True) > 0.0, -view, view)

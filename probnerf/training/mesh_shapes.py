@@ -109,7 +109,7 @@ def sample_mesh(thing: MeshObject, seed: int, paints: int = PAINTS) -> ShapeSet:
     """A set of one object (placed already), with paints drawn from the seed."""
     rng = np.random.default_rng([seed, 41])
     surface, normal = thing.surface(rng, SURFACE + NEAR)
-    width = np.exp(rng.uniform(*np.log(OFFSET), (NEAR, 1)))
+    width = np.exp(rng.uniform(np.log(OFFSET[0]), np.log(OFFSET[1]), (NEAR, 1)))
     near = surface[SURFACE:] + width * rng.standard_normal((NEAR, 3))
     surface, normal = surface[:SURFACE], normal[:SURFACE]
     points = as_units(np.concatenate([near, rng.uniform(-1.0, 1.0, (ANYWHERE, 3))]))

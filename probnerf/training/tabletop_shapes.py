@@ -46,7 +46,7 @@ def tabletop_shapes(seeds: np.ndarray, progress: Callable[[int, int], None] | No
 def _shapes(objects: TabletopObject, seeds: np.ndarray) -> ShapeSet:
     surface, normal, rgb, valid = (np.asarray(a) for a in _surface(objects, jnp.asarray(seeds)))
     rng = [np.random.default_rng([int(s), 41]) for s in seeds]
-    width = np.stack([np.exp(r.uniform(*np.log(OFFSET), (NEAR, 1))) for r in rng])
+    width = np.stack([np.exp(r.uniform(np.log(OFFSET[0]), np.log(OFFSET[1]), (NEAR, 1))) for r in rng])
     near = surface[:, SURFACE:] + width * np.stack([r.standard_normal((NEAR, 3)) for r in rng])
     points = as_units(np.concatenate([near, np.stack([r.uniform(-1.0, 1.0, (ANYWHERE, 3)) for r in rng])], axis=1))
     grid = np.broadcast_to(centres(GRID).astype(np.float32), (len(seeds), GRID**3, 3))

@@ -25,7 +25,8 @@ def test_a_shaft_is_thin_and_a_head_is_not() -> None:
     head = trimesh.creation.box((0.06, 0.06, 0.05))
     shaft = trimesh.creation.box((0.16, 0.006, 0.006))
     shaft.apply_translation([0.1, 0.0, 0.0])
-    thing = canonical(*(lambda m: (m.vertices, m.faces))(trimesh.util.concatenate([head, shaft])))
+    vertices = np.concatenate([head.vertices, shaft.vertices])
+    thing = canonical(vertices, np.concatenate([head.faces, shaft.faces + len(head.vertices)]))
     thin = thin_parts(walls(thing), thing.half_extent)
     x = voxel_centres(GRID)[..., 0]
     middle = 0.25  # cube units: beyond it there is only the shaft

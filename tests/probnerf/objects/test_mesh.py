@@ -18,7 +18,14 @@ def spoon() -> trimesh.Trimesh:
     """A ball with a rod: no symmetry between its ends."""
     rod = trimesh.creation.box((0.12, 0.01, 0.01))
     rod.apply_translation([0.09, 0.0, 0.0])
-    return trimesh.util.concatenate([trimesh.creation.icosphere(3, 0.04), rod])
+    return together(trimesh.creation.icosphere(3, 0.04), rod)
+
+
+def together(*parts: trimesh.Trimesh) -> trimesh.Trimesh:
+    """One mesh of several."""
+    joined = trimesh.util.concatenate(list(parts))
+    assert isinstance(joined, trimesh.Trimesh)
+    return joined
 
 
 def test_the_cube_holds_a_box_as_it_stands() -> None:
@@ -40,7 +47,7 @@ def test_distances_of_a_box_are_exact() -> None:
 
 def test_overlapping_parts_are_solid_throughout() -> None:
     """Where two closed parts overlap a ray crosses an even number of faces, and the winding number is 2."""
-    thing = canonical(*_parts(trimesh.util.concatenate([box(0.1, 0.1, 0.1), box(0.06, 0.06, 0.06)])))
+    thing = canonical(*_parts(together(box(0.1, 0.1, 0.1), box(0.06, 0.06, 0.06))))
     assert thing.signed_distance(np.array([[0.0, 0.0, BASE_Z + 0.5 * BODY_EXTENT]]))[0] < 0.0
 
 
