@@ -20,9 +20,9 @@ _PLACES = 17  # sideways, at which it is tried
 class ViewDraws:
     """What is drawn. Ranges are uniform."""
 
-    width: int = 640  # px
-    height: int = 480  # px
-    focal: tuple[float, float] = (450.0, 700.0)  # px
+    focal: tuple[float, float] = (250.0, 650.0)  # px: pictures of cheap and good cameras
+    width: float = 1.1  # focal lengths
+    height: float = 0.825  # focal lengths
     elevation: tuple[float, float] = (12.0, 70.0)  # degrees above the table
     distance: tuple[float, float] = (0.35, 1.0)  # m from the object's middle,
     nearest: float = 3.5  # and at least so many half extents of the object
@@ -54,8 +54,9 @@ def draw_view(
     draws = draws or ViewDraws()
     target = PlacedMesh(shape, rng.uniform(-0.05, 0.05), rng.uniform(-0.05, 0.05), rng.uniform(-np.pi, np.pi))
     focal = rng.uniform(*draws.focal)
-    K = np.array([[focal, 0, draws.width / 2], [0, focal, draws.height / 2], [0, 0, 1]])
-    camera = Camera(draws.width, draws.height, K, np.zeros(5))
+    width, height = round(draws.width * focal), round(draws.height * focal)
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    camera = Camera(width, height, K, np.zeros(5))
     T = _stand(target, rng, draws)
     objects = [target]
     if rng.random() < draws.before:

@@ -17,7 +17,7 @@ from probnerf.likelihood.position import pose_of
 pytest.importorskip("embreex")
 SIDES = np.array([0.10, 0.06, 0.08])
 SHAPE = box_shape(SIDES, np.array([0.7, 0.4, 0.2]))
-ALONE = ViewDraws(320, 240, (300.0, 300.0), (25.0, 50.0), (0.45, 0.55), beside=0.0, before=0.0, border=0.0)
+ALONE = ViewDraws((300.0, 300.0), elevation=(25.0, 50.0), distance=(0.45, 0.55), beside=0.0, before=0.0, border=0.0)
 BIASED = SensorConfig(noise=0.0005, noise_z2=0.0, bias=(0.004, 0.0, 0.0))
 
 
@@ -115,7 +115,7 @@ def test_borders_cut_the_object() -> None:
 def test_refusals_are_counted_by_reason() -> None:
     """Every seed gives an example or a reason; the same seeds give the same."""
     huge = MeshShape(SHAPE.vertices, SHAPE.faces, 0.5, (0.5, 0.5, 0.5))
-    small = ViewDraws(160, 120, (150.0, 150.0))
+    small = ViewDraws((150.0, 150.0))
     examples, reasons = draw_examples(range(6), [SHAPE, huge], 16, views=small)
     assert len(examples) + reasons.total() == 6 and examples and reasons
     assert all(not any(c.isdigit() for c in reason) for reason in reasons)
