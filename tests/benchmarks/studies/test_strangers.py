@@ -59,6 +59,7 @@ def test_older_rows_are_compared_on_the_same_points_only(tmp_path: Path) -> None
         summary(rows(), options)
 
 
+@pytest.mark.slow
 def test_an_object_goes_from_mesh_to_rows_once(tmp_path: Path) -> None:
     folder = tmp_path / "meshes" / "bullet3"
     folder.mkdir(parents=True)

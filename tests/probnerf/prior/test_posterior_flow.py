@@ -68,6 +68,7 @@ def test_draws_follow_the_density(network, features):
         np.testing.assert_allclose(np.cov(rest.T), np.eye(2), atol=0.06)
 
 
+@pytest.mark.slow
 def test_the_yaw_s_density_integrates_to_one_over_the_circle_and_its_draws_follow_it():
     yaw = YawMixture.of(2.0 * jax.random.normal(jax.random.key(5), (YawMixture.outputs(5),)))
     grid = jnp.linspace(-jnp.pi, jnp.pi, 40_001)
@@ -82,6 +83,7 @@ def test_the_yaw_s_density_integrates_to_one_over_the_circle_and_its_draws_follo
     assert np.ptp(even) < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [4, 5])
 def test_the_flow_s_inverse_undoes_it_and_its_log_determinant_is_autodiff_s(dim: int):
     def build(key):
@@ -115,6 +117,7 @@ def test_turning_the_frame_turns_the_density(network):
     assert np.ptp(np.asarray(here) - np.asarray(_density(network, _features(network, picture(), False), there))) > 0.1
 
 
+@pytest.mark.slow
 def test_the_points_moments_turn_with_the_yaw():
     summary = eqx.filter_jit(lambda key: PictureSummary(8, 2, 8, 1, 3, 2, 16, key))(jax.random.key(0))
     moments = eqx.filter_jit(lambda azimuth_picture: summary.moments(azimuth_picture))

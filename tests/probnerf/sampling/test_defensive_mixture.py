@@ -44,6 +44,7 @@ def test_its_draws_follow_its_density(mixture: DefensiveMixture):
     np.testing.assert_allclose(second, 1.0, atol=0.15)
 
 
+@pytest.mark.slow
 def test_slopes_are_finite_everywhere_and_are_the_differences(mixture: DefensiveMixture):
     x = np.array(jax.random.normal(jax.random.key(2), (6, DIM)))
     difference = np.zeros_like(x)

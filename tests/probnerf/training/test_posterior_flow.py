@@ -144,6 +144,7 @@ def test_a_killed_run_resumes_with_identical_results(tmp_path: Path) -> None:
         run(tmp_path / "killed", config=replace(CONFIG, learning_rate=1.0))
 
 
+@pytest.mark.slow
 def test_a_given_pose_leaves_only_the_shape(tmp_path: Path) -> None:
     """And pictures that tell z teach z~ = m^-1(z)."""
     config = replace(CONFIG, known_pose=1.0)
