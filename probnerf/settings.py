@@ -50,6 +50,28 @@ class ModesConfig:
 
 
 @dataclass(frozen=True)
+class NetworkConfig:
+    """What is done with the draws of a posterior network, and when their importance weights are answer enough."""
+
+    guess: int = 128  # draws that are the first answer
+    prior_share: float = 0.1  # of the mixture that weighed draws and tempering begin from
+    chunk: int = 512  # draws weighed at a time ...
+    most: int = 4096  # ... and in all; fewer than a chunk: none are weighed
+    enough_ess: float = 200.0
+    largest_k: float = 0.7  # of the weights' tail (`sampling.pareto_tail`)
+    apart: float = 0.5  # nats; largest difference of the two halves' log-evidences
+
+    def __post_init__(self) -> None:
+        if self.guess < 1 or not 0 < self.prior_share < 1 or not min(self.enough_ess, self.apart) > 0:
+            raise ValueError(
+                f"guess {self.guess} must be 1 or more, prior_share {self.prior_share:g} between 0 and 1,"
+                f" and enough_ess {self.enough_ess:g} and apart {self.apart:g} more than 0"
+            )
+        if self.chunk < 64 or self.chunk % 64 or self.most < 0:
+            raise ValueError(f"chunk {self.chunk} must be a multiple of 64, and most {self.most} 0 or more")
+
+
+@dataclass(frozen=True)
 class TemperedSMCConfig:
     """Sizes and targets; all are compiled in."""
 
@@ -144,6 +166,8 @@ class InferConfig:
     # from one or two starts, and lose the other modes.
     smc: TemperedSMCConfig = field(default_factory=lambda: quick_smc(8, 8))
     smc_from_prior: TemperedSMCConfig = field(default_factory=lambda: quick_smc(4, 48))
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    smc_from_network: TemperedSMCConfig = field(default_factory=lambda: quick_smc(8, 8))
     hmc: AnnealedHMCConfig = field(default_factory=AnnealedHMCConfig)
     lattice: int = 32  # G: cubes per 2 units
     extent: float = 1.1  # the lattice covers [-extent, extent]^3: an object may be larger than its guessed cube
@@ -155,6 +179,7 @@ class InferConfig:
     # kappa: what one ray counts for, which stands for many pixels; with 1 validation objects' answers were too cautious
     power: float = 2.0
     encoder_starts: bool = True  # begin at the modes that the encoder's guesses climb to; otherwise at the prior
+    network_starts: bool = True  # begin at the draws of the prior's posterior network, if it has one
     sample_delta: bool = False  # also infer the weights' perturbation delta
 
     def __post_init__(self) -> None:

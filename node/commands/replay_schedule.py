@@ -109,10 +109,10 @@ def _check(path: Path, entries: Sequence[Scheduled], prior: Prior, config: Repla
     current = config_hash(config.inference, config.segment, config.track)
     without_track = config_hash(config.inference, config.segment)  # what Farside before 0.2.0 recorded
     for entry in entries:
-        if entry.prior_hash != prior.hash:
+        if entry.prior_hash != prior.identity:
             raise ValueError(
-                f"{path} was recorded with prior {entry.prior_hash}, and this one is {prior.hash}; give that one's file"
-                " with --prior"
+                f"{path} was recorded with prior {entry.prior_hash}, and this one is {prior.identity}; give that one's"
+                " file with --prior"
             )
         if entry.config_hash == without_track:
             raise ValueError(

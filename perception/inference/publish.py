@@ -76,7 +76,7 @@ def published(
         out_of_model=fit < config.out_of_model_below,
         stage=int(d.stages),
         monte_carlo_error=0.0,
-        prior_hash=prior.hash,
+        prior_hash=prior.identity,
         seed=seed,
         diagnostics=AnswerDiagnostics(
             acceptance=float(d.acceptance),

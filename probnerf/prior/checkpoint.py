@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,11 +24,18 @@ SHIPPED = Path(__file__).parent / "weights" / "tabletop.safetensors"
 
 @dataclass(frozen=True)
 class Prior:
-    """A trained prior and where it comes from."""
+    """A trained prior, where it comes from, and the posterior network that was trained for it, if there is one."""
 
     model: ProbNeRF
     metadata: dict[str, Any]  # preset, family, seeds, revision, recipe, gate figures
-    hash: str  # of the file's bytes; identifies the prior in every posterior
+    hash: str  # of the file's bytes
+    network: PosteriorNetwork | None = None
+    network_hash: str = ""  # of the network's file
+
+    @property
+    def identity(self) -> str:
+        """What identifies prior and network in every posterior: their hashes."""
+        return self.hash if self.network is None else f"{self.hash}+{self.network_hash}"
 
 
 @dataclass(frozen=True)
@@ -56,11 +63,17 @@ def save_prior(path: Path, model: ProbNeRF, metadata: dict[str, Any], half: bool
     write_whole(path, save(arrays, metadata={"farside": json.dumps(story, sort_keys=True)}))
 
 
-def load_prior(path: Path | None = None, preset: str | None = None) -> Prior:
-    """Read a prior. None is the one shipped with the project. `preset` is the preset that the caller requires, if any.
+def network_path(prior: Path) -> Path:
+    """Where the posterior network of the prior in this file is looked for: NAME.network.safetensors beside it."""
+    return prior.with_suffix(".network.safetensors")
 
+
+def load_prior(path: Path | None = None, preset: str | None = None) -> Prior:
+    """Read a prior, and its posterior network if the file is there (`network_path`).
+
+    None is the prior shipped with the project. `preset` is the preset that the caller requires, if any.
     Raises FileNotFoundError if there is no file. Raises ValueError if it is not a prior, is damaged or has another
-    preset. Messages have one line.
+    preset, or if the network's file is damaged or another prior's. Messages have one line.
     """
     path = SHIPPED if path is None else Path(path)
     if not path.is_file():
@@ -72,8 +85,12 @@ def load_prior(path: Path | None = None, preset: str | None = None) -> Prior:
         raise ValueError(f"{path} holds preset '{story['preset']}', not '{preset}'; give weights of that preset")
     # shapes only: initialising weights just to replace them would take seconds
     model = jax.eval_shape(lambda key: ProbNeRF(PRESETS[story["preset"]], key), jax.random.key(0))
-    model = _filled(model, arrays, path, f"preset '{story['preset']}'")
-    return Prior(model, story, _hash(path))
+    prior = Prior(_filled(model, arrays, path, f"preset '{story['preset']}'"), story, _hash(path))
+    beside = network_path(path)
+    if not beside.is_file():
+        return prior
+    found = load_posterior_network(beside, prior)
+    return replace(prior, network=found.network, network_hash=found.hash)
 
 
 def save_posterior_network(path: Path, network: PosteriorNetwork, prior: str, metadata: dict[str, Any]) -> None:
