@@ -17,13 +17,14 @@ from probnerf.prior.networks import ProbNeRF
 from probnerf.prior.posterior_network import EncoderPicture, encoder_positions, even_yaws, guesses
 from probnerf.rendering import foam
 from probnerf.sampling.annealed_hmc import annealed_hmc
+from probnerf.sampling.defensive_mixture import DefensiveMixture
 from probnerf.sampling.gaussian_mixture import GaussianMixture
-from probnerf.sampling.hmc import StageInfo
+from probnerf.sampling.hmc import Reference, StageInfo
 from probnerf.sampling.modes import mixture_of_modes
-from probnerf.sampling.populations import start_from
+from probnerf.sampling.populations import from_draws, start_from
 from probnerf.sampling.tempered_smc import tempered_smc
 from probnerf.settings import InferConfig, TemperedSMCConfig
-from probnerf.types import Diagnostics, Observation, Posterior, StopReason, on_device
+from probnerf.types import Observation, Posterior
 
 _log_likelihood = program()(log_likelihood)
 
@@ -101,16 +102,17 @@ def modes_of(
     return mixture_of_modes(args, starts, config.modes)
 
 
-def sampler_of(
-    config: InferConfig, reference: GaussianMixture | None, before: Posterior | None = None
-) -> TemperedSMCConfig:
+def sampler_of(config: InferConfig, reference: Reference | None, before: Posterior | None = None) -> TemperedSMCConfig:
     """The SMC settings for a given reference. A run that continues `before` keeps the settings that produced it."""
     if before is None:
+        if isinstance(reference, DefensiveMixture):
+            return config.smc_from_network
         return config.smc_from_prior if reference is None else config.smc
     made = len(before.diagnostics.beta)
-    both = [smc for smc in (config.smc, config.smc_from_prior) if made % smc.populations == 0]
-    each = len(before.positions) / made  # both settings may divide the number of populations
-    return min(both, key=lambda smc: abs(each - smc.moves * smc.particles), default=config.smc_from_prior)
+    every = (config.smc, config.smc_from_prior, config.smc_from_network)
+    fit = [smc for smc in every if made % smc.populations == 0]
+    each = len(before.positions) / made  # several settings may divide the number of populations
+    return min(fit, key=lambda smc: abs(each - smc.moves * smc.particles), default=config.smc_from_prior)
 
 
 def infer(
@@ -119,7 +121,7 @@ def infer(
     observation: Observation,
     config: InferConfig | None = None,
     *,
-    reference: GaussianMixture | None = None,
+    reference: Reference | None = None,
     before: Posterior | None = None,
     sample_pose: bool = True,
     on_stage: Callable[[StageInfo], bool | None] | None = None,
@@ -128,8 +130,9 @@ def infer(
 ) -> tuple[Posterior, Likelihood]:
     """Sample p(z~, pose, delta | observation).
 
-    `reference` is the density at which tempering starts (`modes_of`; None: the prior). `before` replaces it: an
-    unfinished posterior of the same latents, from which to continue. `deadline` is on time.monotonic()'s clock.
+    `reference` is the density at which tempering starts: of `modes_of` or `network_start.defensive` (None: the prior).
+    `before` replaces it: an unfinished posterior of the same latents, from which to continue. `deadline` is on
+    time.monotonic()'s clock.
     `stages` limits the sampler's stages. For annealed HMC it limits the iterations, and the schedule is shortened to
     fit. The start is always made.
     """
@@ -178,9 +181,4 @@ def encoder_guess(
     each = np.exp(values - top).reshape(yaws, draws).mean(axis=1) if np.isfinite(top) else np.ones(yaws)
     with np.errstate(divide="ignore"):
         log_weights = np.log(np.repeat(each / each.sum() / draws, draws))
-    nan, zero, none = on_device(np.nan), on_device(0, np.int32), on_device(0.0)
-    nans, ess = on_device(np.full(len(values), np.nan)), on_device(1.0 / np.sum(np.exp(2.0 * log_weights)))
-    diagnostics = Diagnostics(nan, zero, nan, ess, zero, zero, none, on_device(np.zeros(1)), on_device([np.nan]))
-    likelihoods, population = on_device(values), on_device(np.zeros(len(values)), np.int32)
-    weights = on_device(log_weights)
-    return Posterior(positions, weights, likelihoods, nans, population, nan, nan, diagnostics, StopReason.UNDERWAY)
+    return from_draws(positions, log_weights, values)

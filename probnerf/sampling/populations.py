@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from probnerf.sampling.hmc import HMCState, split_r_hat
-from probnerf.types import Diagnostics, Posterior, StopReason
+from probnerf.types import Diagnostics, Posterior, StopReason, on_device
 
 # A population has failed if its log-evidence is more than this below the best one (nats): it never left a poor mode.
 # Populations in different good modes differ by a few nats, mostly noise. On validation views this threshold made no
@@ -86,6 +86,38 @@ def gathered(
             log_evidences=jax.device_put(np.asarray(log_evidences, np.float32)),
             **others,
         ),
+        result=result,
+    )
+
+
+def from_draws(
+    positions: Float[Array, "n d"],
+    log_weights: Float[np.ndarray, "n"],
+    log_likelihoods: Float[np.ndarray, "n"] | None = None,
+    log_density: Float[np.ndarray, "n"] | None = None,
+    groups: int = 1,
+    log_evidences: Float[np.ndarray, "m"] | None = None,
+    log_evidence: float = float("nan"),
+    log_evidence_se: float = float("nan"),
+    beta: float = 0.0,
+    result: StopReason = StopReason.UNDERWAY,
+) -> Posterior:
+    """Independent draws of some density with normalised weights as a posterior. What is left out is NaN.
+
+    Every `groups`-th draw is of one population, so that the spread of their answers tells the Monte Carlo error.
+    """
+    nan, zero, nans = on_device(np.nan), on_device(0, np.int32), np.full(len(log_weights), np.nan)
+    evidences = np.full(groups, np.nan) if log_evidences is None else log_evidences
+    ess, betas = on_device(1.0 / np.sum(np.exp(2.0 * log_weights))), on_device(np.full(groups, beta))
+    return Posterior(
+        positions=positions,
+        log_weights=on_device(log_weights),
+        log_likelihoods=on_device(nans if log_likelihoods is None else log_likelihoods),
+        log_density=on_device(nans if log_density is None else log_density),
+        population=on_device(np.arange(len(log_weights)) % groups, np.int32),
+        log_evidence=on_device(log_evidence),
+        log_evidence_se=on_device(log_evidence_se),
+        diagnostics=Diagnostics(nan, zero, nan, ess, zero, zero, on_device(0.0), betas, on_device(evidences)),
         result=result,
     )
 
