@@ -46,7 +46,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("likelihood",),
         ("prior",),
         ("sampling",),
-        ("inference", "shapes"),
+        ("inference", "network_start", "shapes"),
         ("objects",),
         ("training",),
     ),

@@ -45,6 +45,8 @@ DEPTHS = ("RGB-D", "colour only")
 CONDITIONS = tuple(f"{handle}, {depth}" for handle in ("hidden", "informative") for depth in DEPTHS)
 WITH_DEPTH = tuple(c for c in CONDITIONS if c.endswith(DEPTHS[0]))
 TELLING = CONDITIONS[:1]  # where levers are compared
+SAMPLERS = ("smc", "smc_from_prior", "smc_from_network")  # in `InferConfig`, each for another start
+AT_PRIOR = {"encoder_starts": False, "network_starts": False}  # where inference begins
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +213,7 @@ def _estimate(
     def sample(q: Question, short: bool) -> Sampled:
         """Perception's answer."""
         own = q.config.infer
-        populations = {name: replace(getattr(own, name), **(smc or {})) for name in ("smc", "smc_from_prior")}
+        populations = {name: replace(getattr(own, name), **(smc or {})) for name in SAMPLERS}
         sampler = replace(own, **(infer or {}), **populations)
         limits = {"stages": None if stages is None else 2} if short else {"stages": stages, "budget_s": budget_s}
         config = replace(q.config, infer=sampler)
@@ -239,7 +241,7 @@ def paper_schedule(hmc: AnnealedHMCConfig, conditions: tuple[str, ...] = CONDITI
 
 
 CONTROLLER = _estimate("controller", "controller", "to the end", runs=None)
-FROM_PRIOR = _estimate("from the prior", "controller", "from the prior", runs=None, infer={"encoder_starts": False})
+FROM_PRIOR = _estimate("from the prior", "controller", "from the prior", runs=None, infer=AT_PRIOR)
 VI, PAPER = _vi(VIConfig()), paper_schedule(annealed(100, 100))
 FULL = PAPER.name  # the paper's own schedule; it takes long
 METHODS = (
@@ -259,7 +261,7 @@ METHODS = (
         "lever off",
         "P from the prior",
         stages=60,
-        infer={"encoder_starts": False},
+        infer=AT_PRIOR,
         conditions=TELLING,
     ),
     _estimate(
@@ -292,7 +294,7 @@ METHODS = (
 
 def settings_of(method: Method, config: ControllerConfig) -> Line:
     """A method's own settings, and a digest of all else that observation and inference were set to."""
-    own = ("smc", "smc_from_prior", "modes")  # of the sampler, which other methods do not have
+    own = (*SAMPLERS, "modes", "network")  # of the sampler, which other methods do not have
     infer = {name: value for name, value in asdict(config.infer).items() if method.smc or name not in own}
     shared = {"infer": infer, "observe": asdict(config.observe), "hypotheses": config.hypotheses}
     return {**method.settings, "config": digest(shared)[:8]}

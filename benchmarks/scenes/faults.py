@@ -143,7 +143,12 @@ def _particles(config: ControllerConfig, amount: float) -> ControllerConfig:
         return replace(smc, particles=particles, start_particles=start)
 
     own = config.infer
-    infer = replace(own, smc=fewer(own.smc), smc_from_prior=fewer(own.smc_from_prior))
+    infer = replace(
+        own,
+        smc=fewer(own.smc),
+        smc_from_prior=fewer(own.smc_from_prior),
+        smc_from_network=fewer(own.smc_from_network),
+    )
     return replace(config, infer=infer)
 
 

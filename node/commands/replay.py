@@ -74,7 +74,8 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
             continue
         if not done and not is_source:
             (kept / "meta.json").unlink(missing_ok=True)  # an older frame must not stay beside new objects
-        path = publish(config.folder, frame, found, result.hypotheses, result.seconds, out, result.log)
+        log = (f"started at {result.start}", *result.log)
+        path = publish(config.folder, frame, found, result.hypotheses, result.seconds, out, log)
         if not done:
             _clear_others(config.folder, path, result.hypotheses if config.object is not None else None, out)
             if not is_source:

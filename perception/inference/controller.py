@@ -1,11 +1,14 @@
 """Adaptive inference: from a frame's segment to published hypotheses, with as many sampler runs as the scene needs.
 
-A run is a small sampler: a few independent populations of a few particles. They begin where climbs from the encoder's
-guesses end. From the populations' disagreement about unseen space follows the score that their small number is expected
-to lose there (`publish.expected_loss`). If it is above the tolerance, the controller makes the further runs that should
-reduce it enough (it falls with their number), and pools their populations. If the shapes leave too many pixels
-unexplained (a posterior-predictive check), it makes all allowed runs. An answer can be published from the start, and a
-better one after each step.
+If the prior has a posterior network, its draws are the first answer. Where their importance weights are good enough,
+these are the last one. Else sampling begins there.
+
+A run is a small sampler: a few independent populations of a few particles. Without a network, they begin where climbs
+from the encoder's guesses end. From the populations' disagreement about unseen space follows the score that their small
+number is expected to lose there (`publish.expected_loss`). If it is above the tolerance, the controller makes the
+further runs that should reduce it enough (it falls with their number), and pools their populations. If the shapes leave
+too many pixels unexplained (a posterior-predictive check), it makes all allowed runs. An answer can be published from
+the start, and a better one after each step.
 
 Lattice and rays are the same for every scene. With half of both, shapes were worse on easy and hard scenes, and no
 check predicted where (`farside bench frontier` can measure a coarse lattice).
@@ -31,6 +34,7 @@ from perception.sources.frame import Frame
 from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.checkpoint import Prior
 from probnerf.sampling.hmc import StageInfo
+from probnerf.sampling.importance import WeighedDraws
 from probnerf.sampling.populations import pooled
 from probnerf.types import Observation, Posterior, StopReason
 
@@ -46,7 +50,8 @@ class Estimate:
     object_frame: ObjectFrame
     seconds: float
     log: tuple[str, ...] = ()  # why there were more runs, and why no more, a line an answer
-    parts: dict[str, float] = field(default_factory=dict)  # s; of them: climbing, sampling, publishing
+    parts: dict[str, float] = field(default_factory=dict)  # s; of them: network, climbing, sampling, publishing
+    start: str = ""  # where sampling began, in words
 
 
 def estimate(
@@ -96,11 +101,20 @@ def infer_view(
     sampler = ViewSampler(view, prior, config.infer, seed, limits, before)
     publisher = _Publisher(sampler, config, callbacks)
     may_grow = before is None and config.infer.method == "tempered_smc"
-    if sampler.asks_encoder:
-        publisher.hand_out_guess()
-        sampler.climb()
     runs: list[Posterior] = []
     wanted, stop, log = 1, None, list[str]()
+    if sampler.asks_network:
+        publisher.hand_out_guess()
+        draws = sampler.weigh()
+        if draws is not None:
+            enough = draws.suffice(config.infer.network)
+            log.append(publisher.draws_line(draws, enough))
+            if enough:  # nothing is left to sample
+                runs = [draws.posterior()]
+                answer = publisher.publish_draws(runs[0])
+    elif sampler.asks_encoder:
+        publisher.hand_out_guess()
+        sampler.climb()
     while stop is None and len(runs) < wanted:
         new, stop = sampler.more_runs(len(runs), wanted, publisher.after_stage)
         if new:
@@ -127,6 +141,7 @@ def infer_view(
         seconds=time.monotonic() - begun,
         log=tuple(log),
         parts=sampler.stopwatch.seconds,
+        start=sampler.start,
     )
 
 
@@ -144,7 +159,12 @@ class _Publisher:
     def publish_runs(self, runs: list[Posterior]) -> Hypotheses:
         """The answer of several runs together."""
         self._whole = True
-        return self._published(pooled(runs, self.sampler.smc.evidence_power), self.config.hypotheses)
+        power = self.sampler.smc.evidence_power
+        return self._published(pooled(runs, power), self.config.hypotheses, power)
+
+    def publish_draws(self, draws: Posterior) -> Hypotheses:
+        """The answer of weighed draws, whose weights are those of the posterior."""
+        return self._published(draws, self.config.hypotheses, 1.0)
 
     def hand_out(self, answer: Hypotheses) -> None:
         """Pass an answer on, if anyone listens."""
@@ -152,7 +172,7 @@ class _Publisher:
             self.callbacks.on_answer(answer)
 
     def hand_out_guess(self) -> None:
-        """Publish the encoder's guess, if the callbacks want it."""
+        """Publish the network's or the encoder's guess, if the callbacks want it."""
         if self.callbacks.on_answer is not None and self.callbacks.guess:
             self._hand_out_early(self.sampler.guess())
 
@@ -167,6 +187,13 @@ class _Publisher:
         if self.callbacks.on_answer is not None and not self._whole and time.monotonic() >= due:
             self._hand_out_early(info.samples())
         return None
+
+    @staticmethod
+    def draws_line(draws: WeighedDraws, enough: bool) -> str:
+        """A log line: how good the weights of the network's draws are, and what follows."""
+        line = f"{len(draws.log_weights)} draws of the network: ESS {draws.ess:.0f}, Pareto k {draws.k:.2f}"
+        line += f", halves {draws.apart:.2f} nats apart"
+        return line + (": no tempering is needed" if enough else " -> tempering from there")
 
     def log_line(self, found: Findings, failed: int, wanted: int) -> str:
         """A log line: the findings of the runs so far, and whether more are wanted."""
@@ -184,15 +211,15 @@ class _Publisher:
     def _hand_out_early(self, posterior: Posterior) -> None:
         """An answer of fewer shapes."""
         begun = time.monotonic()
-        self.hand_out(self._published(posterior, self.config.first_hypotheses))
+        self.hand_out(self._published(posterior, self.config.first_hypotheses, self.sampler.smc.evidence_power))
         self._early_at = time.monotonic()
         self._early_s = self._early_at - begun
 
-    def _published(self, posterior: Posterior, count: int) -> Hypotheses:
+    def _published(self, posterior: Posterior, count: int, evidence_power: float) -> Hypotheses:
         sampler, config = self.sampler, replace(self.config, hypotheses=count)
         with sampler.stopwatch.part("publishing"):
             h = published(
                 sampler.view, posterior, sampler.likelihood, sampler.prior, config, sampler.seed,
-                point_gradients=sampler.point_gradients, evidence_power=sampler.smc.evidence_power,
+                point_gradients=sampler.point_gradients, evidence_power=evidence_power,
             )  # fmt: skip
         return replace(h, stage=max(sampler.stages, h.stage))

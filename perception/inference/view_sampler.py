@@ -15,11 +15,13 @@ from perception.inference.stopwatch import Stopwatch
 from perception.observation.encoder_crop import crop
 from probnerf.inference import asks_encoder, crossings_of, encoder_guess, infer, likelihood_of, modes_of, sampler_of
 from probnerf.likelihood.settings import Likelihood
+from probnerf.network_start import defensive, network_guess, network_used, picture_density, weigh_draws
 from probnerf.prior.checkpoint import Prior
 from probnerf.prior.networks import ProbNeRF
+from probnerf.prior.posterior_flow import PictureDensity
 from probnerf.prior.posterior_network import EncoderPicture
-from probnerf.sampling.gaussian_mixture import GaussianMixture
-from probnerf.sampling.hmc import StageInfo
+from probnerf.sampling.hmc import Reference, StageInfo
+from probnerf.sampling.importance import WeighedDraws
 from probnerf.settings import InferConfig, TemperedSMCConfig
 from probnerf.types import Posterior, StopReason
 
@@ -31,8 +33,8 @@ _ONE_AT_A_TIME = RLock()  # another thread of that pool has done its parts (jaxl
 class ViewSampler:
     """Makes runs of the sampler on one view, which begin at the same place, and counts what they cost together.
 
-    That place is `before`, a posterior of the same view that was cut short; or the modes that `climb` finds; or else
-    the prior.
+    That place is `before`, a posterior of the same view that was cut short; or the draws of the prior's posterior
+    network; or, if it has none, the modes that `climb` finds; or else the prior.
     """
 
     view: ConditionedView
@@ -44,7 +46,7 @@ class ViewSampler:
     stopwatch: Stopwatch = field(default_factory=Stopwatch)
     stages: int = 0  # done
     point_gradients: float = 0.0  # field evaluations with gradient
-    _reference: GaussianMixture | None = None  # where all runs begin, if not at the prior
+    _reference: Reference | None = None  # where all runs begin, if not at the prior
     _stage_s: list[float] = field(default_factory=list)  # s; each stage of the latest run
 
     @cached_property
@@ -58,10 +60,40 @@ class ViewSampler:
         return sampler_of(self.config, self._reference, self.before)
 
     @property
+    def start(self) -> str:
+        """Where sampling begins, in words."""
+        if self.before is not None:
+            return "the samples of an earlier run"
+        if self._reference is None:
+            return "the prior"
+        return "the encoder's modes" if self._density is None else "the network's draws"
+
+    @property
+    def asks_network(self) -> bool:
+        """Whether a posterior network tells where to begin."""
+        return self._density is not None
+
+    @property
     def asks_encoder(self) -> bool:
-        """Whether an encoder can guess where the object's modes are."""
-        tempers_anew = self.config.method == "tempered_smc" and self.before is None
-        return tempers_anew and asks_encoder(self.config, self.prior.model, self._picture)
+        """Whether an encoder can guess where the object's modes are, and no network does."""
+        return (
+            self._tempers_anew and not self.asks_network and asks_encoder(self.config, self.prior.model, self._picture)
+        )
+
+    @property
+    def _tempers_anew(self) -> bool:
+        return self.config.method == "tempered_smc" and self.before is None
+
+    @cached_property
+    def _density(self) -> PictureDensity | None:
+        """The posterior network's density for the view; of several views, for the newest one."""
+        network = network_used(self.config, self.prior) if self._tempers_anew else None
+        if network is None:
+            return None
+        view = self.view
+        with self.stopwatch.part("network"):
+            picture = crop(view.frame, view.segment, view.object_frame, network.sizes.image_size)
+            return picture_density(network, picture, view.observation, not view.pose_known)
 
     @cached_property
     def _picture(self) -> EncoderPicture | None:
@@ -78,11 +110,29 @@ class ViewSampler:
         return jax.random.key(self.seed)
 
     def guess(self) -> Posterior:
-        """The encoder's guess. Requires `asks_encoder`."""
-        assert isinstance(self.prior.model, ProbNeRF) and self._picture is not None
+        """The network's answer without sampling, or the encoder's. Requires `asks_network` or `asks_encoder`."""
         key = jax.random.fold_in(self._key, 1)
+        if self._density is not None:
+            with self.stopwatch.part("network"):
+                return network_guess(key, self._density, self.config.network.guess)
+        assert isinstance(self.prior.model, ProbNeRF) and self._picture is not None
         with self.stopwatch.part("climbing"):
             return encoder_guess(key, self.prior.model, self.likelihood, self.view.observation, self._picture)
+
+    def weigh(self) -> WeighedDraws | None:
+        """Have all runs begin at the network's draws, and weigh some of these. None if none may be weighed.
+
+        A run draws its own: those that were weighed are known to be poor, and would bias its evidence.
+        """
+        assert self._density is not None
+        settings, key = self.config.network, jax.random.fold_in(self._key, 2)
+        self._reference = mixture = defensive(self._density, settings)
+        if settings.most < settings.chunk:
+            return None
+        with self.stopwatch.part("network"):
+            return weigh_draws(
+                key, self.prior, self.likelihood, self.view.observation, mixture, settings, self.limits.deadline
+            )
 
     def climb(self) -> None:
         """Have all runs begin at the modes that the encoder's guesses climb to."""

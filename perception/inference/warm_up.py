@@ -14,13 +14,15 @@ from perception.sources.recording import Log
 from perception.sources.settings import SHIPPED_LOG
 from probnerf.compile_cache import rehearsal
 from probnerf.inference import infer
+from probnerf.network_start import network_used
 from probnerf.types import FREE, UNKNOWN, Posterior, StopReason
 
 
 def warm_up(tracker: Tracker) -> None:
     """Infer an object of the shipped recording with a tracker of the same prior and configuration. Infer it once as if
-    nothing occluded it (inference climbs), and once half hidden, as recorded (inference begins at the prior). It is a
-    rehearsal: cached programs (`probnerf.compile_cache`) are read, others are compiled, and none is run.
+    nothing occluded it (inference climbs), and once half hidden, as recorded (inference begins at the prior). With a
+    posterior network both begin at the same place, and once is enough. It is a rehearsal: cached programs
+    (`probnerf.compile_cache`) are read, others are compiled, and none is run.
 
     Raises KeyboardInterrupt if Ctrl-C ended it, even if the sampler caught it.
 
@@ -42,13 +44,15 @@ def warm_up(tracker: Tracker) -> None:
 
 
 def _infer_twice(trial: Tracker, look: Look, frame: Frame, hidden: Segment) -> None:
-    """The object alone, the same continued after an interruption, and half hidden."""
+    """The object alone, the same continued after an interruption, and half hidden where that begins elsewhere."""
     update = trial.infer(look, Limits(stages=1), Callbacks(on_answer=lambda _: None))
     if update.hypotheses.result == StopReason.INTERRUPTED:
         raise KeyboardInterrupt
     again = trial.look(frame, _alone(hidden))
     assert again is not None
     _sampled(trial, again, trial._tracks[again.object_id].posterior)  # as for a next frame
+    if network_used(trial.config.infer, trial.prior) is not None:
+        return
     anew = trial.look(frame, hidden, lambda _: (0, True))
     assert anew is not None  # publishing it needs no new programs
     _sampled(trial, anew, _sampled(trial, anew, None))

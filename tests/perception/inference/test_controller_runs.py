@@ -77,7 +77,7 @@ def inferred(
     """An estimate, and the answers with all their shapes that were handed out: which runs they are of, their result."""
     answers = list[Hypotheses]()
     view: Any = SimpleNamespace(pose_known=True, observation=None, object_frame=None)
-    config, prior = replace(CONFIG, tolerance=tolerance), SimpleNamespace(model=None)
+    config, prior = replace(CONFIG, tolerance=tolerance), SimpleNamespace(model=None, network=None)
     callbacks = Callbacks(on_stage, answers.append)
     found = infer_view(view, prior, config, limits=limits, callbacks=callbacks, **given)
     assert answers[-1] is found.hypotheses and answers[0].monte_carlo_error == 1.0
