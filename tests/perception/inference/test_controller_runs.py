@@ -19,6 +19,7 @@ from probnerf.types import StopReason
 from tests.node.shapes import body_with_handle
 
 STAGES = 2  # of each run
+DRAWS, GUESS = -1, -2  # stand for the numbers of runs
 WHOLE, CUT = StopReason.CONVERGED, StopReason.INTERRUPTED
 
 
@@ -84,6 +85,36 @@ def inferred(
     whole = [h.monte_carlo_error == 0.0 for h in answers]
     assert sorted(whole) == whole  # early ones of few shapes come before all others
     return found, [(h.label, str(h.result)) for h in answers if h.monte_carlo_error == 0.0]
+
+
+def with_network(monkeypatch: pytest.MonkeyPatch, suffice: bool | None) -> None:
+    """A network stands for itself, and so do its weighed draws; None: none are weighed."""
+    numbers: Any = dict(log_weights=[0.0] * 512, ess=250.0, k=0.3, apart=0.1)
+    draws = SimpleNamespace(suffice=lambda _: suffice, posterior=lambda: Runs((DRAWS,), WHOLE), **numbers)
+    monkeypatch.setattr(ViewSampler, "asks_network", True)
+    monkeypatch.setattr(ViewSampler, "guess", lambda _: Runs((GUESS,), StopReason.UNDERWAY))
+    monkeypatch.setattr(ViewSampler, "weigh", lambda _: None if suffice is None else draws)
+
+
+def test_where_the_network_s_draws_suffice_no_run_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    sampler = Sampler(monkeypatch, *[WHOLE] * 4)
+    with_network(monkeypatch, suffice=True)
+    found, answers = inferred(tolerance=0.0)
+    assert sampler.made == [] and answers == [("(-1,)", "converged")] and found.posterior.numbers == (DRAWS,)
+    assert found.log == (
+        "512 draws of the network: ESS 250, Pareto k 0.30, halves 0.10 nats apart: no tempering is needed",
+    )
+
+
+@pytest.mark.parametrize("suffice", [False, None])
+def test_where_they_do_not_the_runs_begin_there(monkeypatch: pytest.MonkeyPatch, suffice: bool | None) -> None:
+    sampler = Sampler(monkeypatch, *[WHOLE] * 4)
+    with_network(monkeypatch, suffice)
+    found, answers = inferred(tolerance=0.015)
+    assert sampler.made == [0, 1, 2]
+    assert answers == [("(0,)", "underway"), ("(0, 1, 2)", "converged")]
+    assert len(found.log) == (2 if suffice is None else 3)
+    assert suffice is None or found.log[0].endswith("halves 0.10 nats apart -> tempering from there")
 
 
 def test_as_many_runs_as_the_loss_takes_answer_together(monkeypatch: pytest.MonkeyPatch) -> None:
