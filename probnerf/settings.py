@@ -55,7 +55,7 @@ class NetworkConfig:
 
     guess: int = 128  # draws that are the first answer
     prior_share: float = 0.1  # of the mixture that weighed draws and tempering begin from
-    chunk: int = 512  # draws weighed at a time ...
+    chunk: int = 256  # draws weighed at a time ...
     most: int = 4096  # ... and in all; fewer than a chunk: none are weighed
     enough_ess: float = 200.0
     largest_k: float = 0.7  # of the weights' tail (`sampling.pareto_tail`)
