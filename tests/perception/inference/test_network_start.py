@@ -1,7 +1,9 @@
 """Inference of a frame with a posterior network: its draws are published at once, and sampling begins there."""
 
+import gc
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -10,10 +12,13 @@ import pytest
 from perception.answers.hypotheses import Hypotheses
 from perception.inference.controller import Estimate, estimate
 from perception.inference.settings import ControllerConfig
+from perception.inference.tracker import Tracker
 from perception.inference.view_sampler import ViewSampler
+from perception.inference.warm_up import warm_up
 from perception.observation.object_frame import ObjectFrame
 from perception.observation.segmentation import segment
 from perception.sources.frame import Frame
+from probnerf import compile_cache
 from probnerf.prior.checkpoint import Prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.settings import InferConfig, NetworkConfig, quick_smc
@@ -97,6 +102,23 @@ def test_weights_that_suffice_end_it(prior: Prior) -> None:
     assert h is answers[-1] and len(answers) == 2 and h.stage == 0 and h.result == "converged"
     assert h.diagnostics.ess >= 200.0 and h.diagnostics.beta == 1.0 and np.isfinite(h.diagnostics.log_evidence)
     assert len(np.unique(h.population)) == 8 and h.failed == 0
+
+
+@pytest.mark.slow
+def test_a_rehearsal_leaves_nothing_to_compile_for_the_first_frame(
+    prior: Prior, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its zeros are no good weights: tempering is rehearsed, too."""
+    monkeypatch.setattr(compile_cache, "_folder", lambda: tmp_path)
+    try:
+        warm_up(Tracker(prior, CONFIG))
+    finally:
+        gc.unfreeze()
+    kept = {path.name for path in tmp_path.iterdir()}
+    assert {"_features", "_drawn", "_chunk", "_stage"} <= {name.rsplit("-", 1)[0] for name in kept}
+    frame = frame_from(0.0)
+    update = Tracker(prior, CONFIG).update(frame, segment(frame)[0], stages=2, on_answer=lambda _: None)
+    assert update.hypotheses.stage > 0 and {path.name for path in tmp_path.iterdir()} == kept
 
 
 @pytest.mark.slow
