@@ -33,7 +33,7 @@ def test_a_guess_is_equal_draws_whose_density_is_known_and_nothing_else(sample_p
 
 def test_the_network_is_used_by_tempering_unless_it_is_told_otherwise() -> None:
     config, model = InferConfig(smc_from_network=quick_smc(3, 4)), None
-    without, prior = Prior(model, {}, "x"), Prior(model, {}, "x", NETWORK)  # type: ignore[arg-type]
+    without, prior = Prior(model, {}, "x"), Prior(model, {}, "x", NETWORK)
     assert network_used(config, prior) is NETWORK and network_used(config, without) is None
     for other in ({"network_starts": False}, {"sample_delta": True}, {"method": "annealed_hmc"}):
         assert network_used(replace(config, **other), prior) is None
