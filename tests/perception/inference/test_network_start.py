@@ -59,6 +59,7 @@ def inferred(
     return found, answers
 
 
+@pytest.mark.slow
 def test_the_guess_is_the_first_answer_and_tempering_begins_at_the_network(prior: Prior) -> None:
     found, answers = inferred(frame_from(0.0), prior, CONFIG)
     guess = answers[0]
