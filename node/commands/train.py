@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+import zlib
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from importlib.util import find_spec
@@ -100,7 +101,9 @@ def _material(
         return [], views, {"family": "srn", "data": options.data.name, "objects": len(views.seeds)}
     sampling = progress.add_task("objects", total=options.objects)
     seeds = np.asarray(TRAIN_SEEDS[: options.objects])
-    tabletop = _kept(options.out / "shapes" / "tabletop.npz", lambda: tabletop_shapes(seeds, advance(sampling)))
+    tabletop = _kept(
+        options.out / "shapes" / f"tabletop-{options.objects}.npz", lambda: tabletop_shapes(seeds, advance(sampling))
+    )
     others = _mesh_sets(options, progress, advance)
     pictured, pictures = min(options.pictured, options.objects), options.pictures or 8
     drawing = progress.add_task("pictures", total=pictured)
@@ -127,13 +130,12 @@ def _mesh_sets(
     from probnerf.training import mesh_shapes  # only here: it needs them
 
     folder, found = options.out / "shapes", {}
+    each = max(1, options.variants // 4)  # variants of a household thing
     if options.household:
         task = progress.add_task("household", total=options.household)
         found["household"] = _kept(
-            folder / "household.npz",
-            lambda: mesh_shapes.household_shapes(
-                TRAIN_SEEDS[: options.household], max(1, options.variants // 4), advance(task)
-            ),
+            folder / f"household-{options.household}x{each}.npz",
+            lambda: mesh_shapes.household_shapes(TRAIN_SEEDS[: options.household], each, advance(task)),
         )
     for meshes in options.meshes:
         task = progress.add_task(meshes.name, total=None)
@@ -144,12 +146,13 @@ def _mesh_sets(
                 progress.console.print(f"left out {line}", highlight=False, soft_wrap=True)
             return shapes
 
-        found[meshes.name] = _kept(folder / f"{meshes.name}.npz", make)
+        path = f"{meshes.name}-{zlib.crc32(str(meshes.resolve()).encode()):08x}x{options.variants}"
+        found[path] = _kept(folder / f"{path}.npz", make)
     return found
 
 
 def _kept(path: Path, make: Callable[[], ShapeSet]) -> ShapeSet:
-    """The set in this file, made where there is none."""
+    """The set in this file, made where there is none. The name holds all that the set was made from."""
     if path.exists():
         return load_shapes(path)
     path.parent.mkdir(parents=True, exist_ok=True)
