@@ -30,7 +30,7 @@ test: setup
 
 # pytest answers 5 where no test is marked slow.
 slow: setup
-	$(BIN)/pytest -m slow $(ARGS) || [ $$? -eq 5 ]
+	$(BIN)/pytest -m slow -n 2 --dist loadfile $(ARGS) || [ $$? -eq 5 ]
 
 smoke: setup
 	.ci/smoke

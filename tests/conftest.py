@@ -1,7 +1,9 @@
 """Tests run JAX on the CPU, reuse programs compiled by earlier runs, and read recorded data where there is some."""
 
+import gc
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -44,6 +46,19 @@ def optimised() -> Iterator[None]:
     jax.config.update(name, False)
     yield
     jax.config.update(name, before)
+
+
+MOST_MAPPINGS = 25_000  # of memory, of a process; Linux refuses more than 65,530, and XLA then aborts
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_programs() -> Iterator[None]:
+    """Drop compiled programs, each a dozen mappings of memory, before a long run of tests holds too many of them."""
+    yield
+    mappings = Path("/proc/self/maps")
+    if "jax" in sys.modules and mappings.exists() and len(mappings.read_bytes().splitlines()) > MOST_MAPPINGS:
+        sys.modules["jax"].clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")
