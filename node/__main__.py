@@ -21,6 +21,7 @@ from node.commands.options import (
     Calibrate,
     Capture,
     LiveConfig,
+    NetworkTraining,
     Query,
     Record,
     ReplayConfig,
@@ -46,6 +47,7 @@ SUMMARIES = {
     "calibrate": str(Calibrate.__doc__).split("\n")[0],
     "capture": str(Capture.__doc__),
     "train": str(Training.__doc__),
+    "train-network": str(NetworkTraining.__doc__),
     "bench": BENCH,
 }
 
@@ -165,6 +167,13 @@ def _train(args: Sequence[str]) -> int:
     return 0 if train(options, Console(), Console(stderr=True)) else 130
 
 
+def _train_network(args: Sequence[str]) -> int:
+    options = tyro.cli(NetworkTraining, args=args, prog="farside train-network")
+    from node.commands.train_network import train_network
+
+    return 0 if train_network(options, Console(), Console(stderr=True)) else 130
+
+
 def _bench(args: Sequence[str]) -> int:
     from node.commands.bench import bench
 
@@ -187,6 +196,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "calibrate": _calibrate,
     "capture": _capture,
     "train": _train,
+    "train-network": _train_network,
     "bench": _bench,
 }
 

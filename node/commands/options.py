@@ -18,7 +18,7 @@ from perception.observation.settings import SegmentConfig
 from perception.sources.settings import SHIPPED_LOG, RecordConfig
 from perception.sources.topic_names import TopicNames
 from probnerf.settings import Method
-from probnerf.training.settings import TrainConfig
+from probnerf.training.settings import PosteriorTrainConfig, TrainConfig
 
 ENDPOINT = "tcp/127.0.0.1:7448"  # the router of ROS 2 has 7447
 
@@ -329,6 +329,22 @@ class Training:
     pictures: int | None = None
     """Pictures of each of them; 8 by default, or all with --data."""
     recipe: tyro.conf.OmitArgPrefixes[TrainConfig] = field(default_factory=TrainConfig)
+
+
+@dataclass(frozen=True)
+class NetworkTraining:
+    """Train a prior's posterior network on simulated pictures of the objects that it learnt; resumes after a stop."""
+
+    run: Path = Path("runs/tabletop")
+    """Folder of a finished run of `farside train`. It gets the pictures, network/ (checkpoint, history, curves.png)
+    and, in the end, prior.network.safetensors."""
+    pictures: int = 20_000
+    """About how many pictures; those that perception refuses count. They are kept, so that a later run can add some."""
+    image_size: int = 32
+    """Pixels a side of a picture."""
+    processes: int | None = None
+    """How many processes draw pictures; all processors by default."""
+    recipe: tyro.conf.OmitArgPrefixes[PosteriorTrainConfig] = field(default_factory=PosteriorTrainConfig)
 
 
 def options_of(kind: type, hidden: bool) -> type:

@@ -3,7 +3,8 @@
 import json
 import subprocess
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,11 +22,12 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from foundation.whole_file import write_whole
 from node.commands.options import Training
 from node.figures.object_figure import draw_training
 from probnerf.likelihood.settings import Likelihood
 from probnerf.objects.tabletop import TRAIN_SEEDS
-from probnerf.prior.checkpoint import load_prior, save_prior
+from probnerf.prior.checkpoint import load_prior, save_prior, save_recognition
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering import foam
 from probnerf.training import elbo as training
@@ -34,6 +36,7 @@ from probnerf.training.shape_set import ShapeSet, load_shapes
 from probnerf.training.srn_dataset import read_views
 from probnerf.training.tabletop_shapes import tabletop_shapes
 
+LEARNT = "learnt.json"  # in the run's folder: which objects it learns
 TABLETOP_SHARE = 0.4  # of a batch, where there are other things; these share the rest by their numbers
 
 
@@ -54,12 +57,15 @@ def train(options: Training, out: Console, err: Console) -> bool:
     begun = None if options.start is None else load_prior(options.start, preset=options.preset)
     key = np.array([0, config.seed], np.uint32)  # a raw key
     model = ProbNeRF(preset, key) if begun is None else begun.model  # type: ignore[arg-type]
-    history, curves, weights = folder / "history.jsonl", folder / "curves.png", folder / "prior.safetensors"
+    weights = folder / "prior.safetensors"
     likelihood = Likelihood(lattice=foam.Lattice(preset.lattice, 1.0, 9 * preset.lattice // 4))
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     state = None
     try:
-        with Progress(*columns, TimeRemainingColumn(), console=err, disable=not err.is_terminal) as progress:
+        with (
+            Progress(*columns, TimeRemainingColumn(), console=err, disable=not err.is_terminal) as progress,
+            drawn_curves(folder, out),
+        ):
             solids, views, story = _material(options, preset.image_size, progress)
             steps = progress.add_task("steps", total=config.steps)
             for state, metrics in training.train(model, solids, views, likelihood, config, folder):  # noqa: B007
@@ -68,23 +74,44 @@ def train(options: Training, out: Console, err: Console) -> bool:
     except KeyboardInterrupt:
         out.print("stopped; the same command continues from the last checkpoint", highlight=False)
         return False
-    finally:
-        if history.is_file() and (lines := history.read_text(encoding="utf-8").splitlines()):
-            draw_training(curves, [json.loads(line) for line in lines])
-            out.print(str(curves), highlight=False, soft_wrap=True)
     if state is None:
         out.print(f"{folder} is trained already", highlight=False, soft_wrap=True)
         return True
     story |= {
         "recipe": asdict(config),
         "steps": int(state.step),
-        "revision": _revision(),
+        "revision": revision(),
         "start": None if begun is None else {"hash": begun.hash, **begun.metadata},
         "gate": None,
     }
     save_prior(weights, state.model, story, half=preset.name == "household")
+    if options.data is None:
+        save_recognition(folder / "recognition.safetensors", state.recognition, load_prior(weights).hash)
     out.print(f"{weights}; judge it with `farside bench prior --prior {weights}`", highlight=False, soft_wrap=True)
     return True
+
+
+@contextmanager
+def drawn_curves(folder: Path, out: Console) -> Iterator[None]:
+    """Draws a run's history in the end, however that comes."""
+    try:
+        yield
+    finally:
+        history, curves = folder / "history.jsonl", folder / "curves.png"
+        if history.is_file() and (lines := history.read_text(encoding="utf-8").splitlines()):
+            draw_training(curves, [json.loads(line) for line in lines])
+            out.print(str(curves), highlight=False, soft_wrap=True)
+
+
+def learnt_objects(run: Path) -> dict[str, Any]:
+    """Which objects the run of this folder learns: `objects`, `household`, `variants` and `meshes` of its options.
+
+    Raises FileNotFoundError if the run does not tell.
+    """
+    path = run / LEARNT
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; give the folder of a run of `farside train` without --data")
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def _material(
@@ -99,6 +126,9 @@ def _material(
         reading = progress.add_task("objects", total=None)
         views = read_views(options.data, size, options.pictures, advance(reading))
         return [], views, {"family": "srn", "data": options.data.name, "objects": len(views.seeds)}
+    learnt = {name: getattr(options, name) for name in ("objects", "household", "variants")}
+    learnt["meshes"] = [str(meshes.resolve()) for meshes in options.meshes]
+    write_whole(options.out / LEARNT, json.dumps(learnt, indent=1).encode())
     sampling = progress.add_task("objects", total=options.objects)
     seeds = np.asarray(TRAIN_SEEDS[: options.objects])
     tabletop = _kept(
@@ -124,13 +154,11 @@ def _mesh_sets(
     """Shapes of the household generator and of every folder of meshes, by name; what was left out is printed."""
     if not options.household and not options.meshes:
         return {}
-    for library in ("igl", "embreex", "manifold3d"):
-        if find_spec(library) is None:
-            raise ValueError(f"meshes need the package {library}: pip install 'farside[meshes]'")
+    require_mesh_libraries()
     from probnerf.training import mesh_shapes  # only here: it needs them
 
     folder, found = options.out / "shapes", {}
-    each = max(1, options.variants // 4)  # variants of a household thing
+    each = household_variants(options.variants)
     if options.household:
         task = progress.add_task("household", total=options.household)
         found["household"] = _kept(
@@ -161,7 +189,19 @@ def _kept(path: Path, make: Callable[[], ShapeSet]) -> ShapeSet:
     return shapes
 
 
-def _revision() -> str:
+def require_mesh_libraries() -> None:
+    """Raises ValueError with the remedy where one of them is missing."""
+    for library in ("igl", "embreex", "manifold3d"):
+        if find_spec(library) is None:
+            raise ValueError(f"meshes need the package {library}: pip install 'farside[meshes]'")
+
+
+def household_variants(variants: int) -> int:
+    """Of a household thing, where a mesh has so many."""
+    return max(1, variants // 4)
+
+
+def revision() -> str:
     """The checkout's git revision, with + where files were changed; empty outside a checkout."""
     command = ("git", "-C", str(Path(__file__).parent), "describe", "--always", "--abbrev=12", "--dirty=+")
     try:

@@ -4,10 +4,18 @@ They are drawn in parts, each a file that depends on its number alone, so that d
 depend on the prior: a part holds each object's description, from which the prior's recognition tells its latents.
 """
 
+import multiprocessing
+import os
 from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -15,7 +23,17 @@ from foundation.whole_file import whole_file
 from perception.simulation.examples import Example, ExampleDraws, draw_example
 from perception.simulation.mesh_scene import MeshShape
 from perception.simulation.view_draws import ViewDraws
+from probnerf.prior.networks import Recognition
 from probnerf.training.learnt_objects import Families, LearntObject, draw_objects
+from probnerf.training.picture_set import PictureSet
+
+OBJECTS, VIEWS = 64, 3  # of a part: objects, and views of each
+LOOKS = ViewDraws(focal=(180.0, 420.0))  # pictures are shrunk anyway; coarser ones are drawn faster
+_ONE_THREAD = {  # of each process; and none of them takes an accelerator's memory
+    "JAX_PLATFORMS": "cpu",
+    "OMP_NUM_THREADS": "1",
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +88,68 @@ def draw_part(
             else:
                 reasons[found] += 1
     return _part(examples, np.array(rows, np.int32), things), reasons
+
+
+def draw_parts(
+    folder: Path,
+    numbers: range,
+    families: Families,
+    size: int,
+    processes: int,
+    objects: int = OBJECTS,
+    views: int = VIEWS,
+) -> Iterator[Path]:
+    """The files of these parts, in any order: those that are there already, and the others when they are drawn."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = {number: folder / f"part_{number:05d}.npz" for number in numbers}
+    missing = [number for number, path in paths.items() if not path.exists()]
+    yield from (path for number, path in paths.items() if number not in missing)
+    if not missing:
+        return
+    with _environment(_ONE_THREAD), ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+        jobs = {pool.submit(_draw_kept, paths[n], n, families, objects, views, size): n for n in missing}
+        try:
+            for job in as_completed(jobs):
+                job.result()
+                yield paths[jobs[job]]
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def picture_set(parts: Sequence[PicturePart], recognition: Recognition) -> PictureSet:
+    """The parts' pictures with their objects' latents, as recognition tells them."""
+    recognised = eqx.filter_jit(jax.vmap(recognition))
+    means, sds = [], []
+    for part in parts:
+        mean, precision = recognised(jnp.asarray(part.description, jnp.float32))
+        means.append(np.asarray(mean)[part.row])
+        sds.append(1.0 / np.sqrt(np.asarray(precision)[part.row]))
+    kept = {f.name for f in fields(PictureSet)} & {f.name for f in fields(PicturePart)} - {"kind"}
+    owner = [(part.family.astype(np.int64) << 40) + part.seed for part in parts]
+    return PictureSet(
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in kept},
+        mean=np.concatenate(means),
+        sd=np.concatenate(sds),
+        object_id=np.concatenate([each[part.row] for each, part in zip(owner, parts, strict=True)]),
+        kind=np.concatenate([part.kind[part.row] for part in parts]),
+    )
+
+
+def _draw_kept(path: Path, number: int, families: Families, objects: int, views: int, size: int) -> None:
+    draw_part(number, families, objects, views, size, looks=LOOKS)[0].save(path)
+
+
+@contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    """Variables of the processes that are started within."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def _part(examples: list[Example], rows: np.ndarray, things: list[LearntObject]) -> PicturePart:

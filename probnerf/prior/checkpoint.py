@@ -1,4 +1,5 @@
-"""Priors and posterior networks on disk: safetensors files (which cannot execute code) with arrays and metadata."""
+"""Priors, posterior networks and recognitions on disk: safetensors files (which cannot execute code) with arrays and
+metadata."""
 
 import hashlib
 import json
@@ -12,13 +13,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from foundation.whole_file import write_whole
-from probnerf.prior.networks import PRESETS, ProbNeRF
+from probnerf.prior.networks import PRESETS, ProbNeRF, Recognition
 from probnerf.prior.posterior_flow import NetworkSizes, PosteriorNetwork
 
 M = TypeVar("M")
 
 FORMAT = "farside-prior-1"
 NETWORK_FORMAT = "farside-posterior-network-1"
+RECOGNITION_FORMAT = "farside-recognition-1"
 SHIPPED = Path(__file__).parent / "weights" / "tabletop.safetensors"
 
 
@@ -124,6 +126,37 @@ def load_posterior_network(path: Path, prior: Prior) -> TrainedNetwork:
         raise ValueError(f"{path} has {sizes.latent} latents, the prior has {prior.model.latent}; train it again")
     network = jax.eval_shape(lambda key: PosteriorNetwork(sizes, key), jax.random.key(0))
     return TrainedNetwork(_filled(network, arrays, path, "this architecture"), story, _hash(path))
+
+
+def save_recognition(path: Path, recognition: Recognition, prior: str) -> None:
+    """Write atomically, in half precision. `prior` is the hash of the prior that it was trained with.
+
+    Raises ValueError if a weight is not finite in half precision.
+    """
+    arrays = _halved({name: np.asarray(leaf) for name, leaf in _named(recognition).items()}, path)
+    first = recognition.hidden.first
+    story = {"format": RECOGNITION_FORMAT, "prior": prior, "inputs": first.in_features, "hidden": first.out_features}
+    write_whole(path, save(arrays, metadata={"farside": json.dumps(story, sort_keys=True)}))
+
+
+def load_recognition(path: Path, prior: Prior) -> Recognition:
+    """Read the recognition of `prior`, in single precision.
+
+    Raises FileNotFoundError if there is no file. Raises ValueError if it is not a recognition, is damaged, or has
+    another prior. Messages have one line.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such recognition; `farside train` writes one beside its prior")
+    story, arrays = _read(path, "recognition", "train the prior again")
+    if story.get("format") != RECOGNITION_FORMAT:
+        raise ValueError(f"{path} has format {story.get('format')}, not {RECOGNITION_FORMAT}; train the prior again")
+    if story.get("prior") != prior.hash:
+        raise ValueError(
+            f"{path} belongs to the prior {story.get('prior')}, not to {prior.hash}; train the prior again"
+        )
+    sizes = (story["inputs"], prior.model.latent, story["hidden"])
+    recognition = jax.eval_shape(lambda key: Recognition(*sizes, key), jax.random.key(0))
+    return _filled(recognition, arrays, path, "this architecture")
 
 
 def _halved(arrays: dict[str, np.ndarray], path: Path) -> dict[str, np.ndarray]:

@@ -8,6 +8,8 @@ is N(0, I) (`probnerf.likelihood.position`).
 
 Internally the frame is turned so that the camera's azimuth is 0. So a picture at a known pose looks like any other, and
 the known yaw is a number that the flow is given.
+
+Beside q stands what kind of thing it is: probabilities of `KINDS`, given the picture alone.
 """
 
 from dataclasses import dataclass, replace
@@ -18,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from probnerf.objects.shape_kinds import KINDS
 from probnerf.prior.conditional_densities import ConditionalFlow, TripleMixture, YawMixture, zeroed
 from probnerf.prior.picture_summary import PictureSummary, affine, harmonics, turned, turned_moments
 from probnerf.prior.posterior_network import EncoderPicture
@@ -54,6 +57,7 @@ class PictureFeatures(eqx.Module):
     moments: Float[Array, "m c"]
     pose: Float[Array, "t"]  # the picture's part of the first layer that leads to x, y and log-scale
     shape: Float[Array, "t"]  # and to z~
+    log_kinds: Float[Array, "kinds"]  # logarithms of the probabilities of `KINDS`
     known: bool = eqx.field(static=True)  # the pose is known: positions are z~ alone
 
 
@@ -70,11 +74,12 @@ class PosteriorNetwork(eqx.Module):
     shape_hidden: eqx.nn.Linear
     shape_output: eqx.nn.Linear
     flow: ConditionalFlow
+    kind: eqx.nn.Linear
     sizes: NetworkSizes = eqx.field(static=True)
 
     def __init__(self, sizes: NetworkSizes, key: PRNGKeyArray):
         self.sizes = s = sizes
-        keys = jax.random.split(key, 10)
+        keys = jax.random.split(key, 11)
         self.summary = PictureSummary(
             s.image_size, s.patch, s.channels, s.blocks, s.harmonics, s.point_channels, s.context, keys[0]
         )
@@ -90,6 +95,7 @@ class PosteriorNetwork(eqx.Module):
         self.shape_hidden = eqx.nn.Linear(s.trunk, s.trunk, key=keys[7])
         self.shape_output = eqx.nn.Linear(s.trunk, s.condition, key=keys[8])
         self.flow = ConditionalFlow(s.latent, s.condition, s.hidden, s.couplings, keys[9])
+        self.kind = zeroed(eqx.nn.Linear(s.context, len(KINDS), key=keys[10]))
 
     def features(
         self,
@@ -116,6 +122,7 @@ class PosteriorNetwork(eqx.Module):
             moments=moments,
             pose=affine(self.pose_picture, context),
             shape=affine(self.shape_picture, context),
+            log_kinds=jax.nn.log_softmax(affine(self.kind, context)),
             known=known,
         )
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from foundation.whole_file import whole_file
 from probnerf.prior.posterior_network import EncoderPicture
@@ -32,6 +32,7 @@ class PictureSet:
     mean: np.ndarray  # f32 [N, K]
     sd: np.ndarray  # f32 [N, K]
     object_id: np.ndarray  # int [N]
+    kind: np.ndarray  # u8 [N], index into KINDS
 
     def __post_init__(self) -> None:
         sizes = {field.name: len(getattr(self, field.name)) for field in fields(self)}
@@ -69,6 +70,7 @@ class Examples(eqx.Module):
     pose: Float[Array, "b 3"]
     mean: Float[Array, "b k"]
     sd: Float[Array, "b k"]
+    kind: Int[Array, "b"]
 
 
 def split(pictures: PictureSet, config: PosteriorTrainConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -108,6 +110,7 @@ def changed(pictures: PictureSet, rows: np.ndarray, rng: np.random.Generator, co
         pose=on_device(np.where(known[:, None], 0.0, pose[:, :3])),
         mean=on_device(pictures.mean[rows]),
         sd=on_device(pictures.sd[rows]),
+        kind=on_device(pictures.kind[rows], np.int32),
     )
 
 

@@ -1,4 +1,4 @@
-"""Training of the posterior network: -log q(z~, yaw, x, y, log-scale | picture) averaged over simulated pictures.
+"""Training of the posterior network: -log q(z~, yaw, x, y, log-scale, kind | picture) averaged over simulated pictures.
 
 This is the forward Kullback-Leibler divergence to the exact posterior, up to a constant (neural posterior estimation;
 Papamakarios and Murray, 2016). At its minimum the network is calibrated for the world that the pictures come from.
@@ -49,13 +49,16 @@ def initial_state(network: PosteriorNetwork, config: PosteriorTrainConfig) -> Po
 
 def log_densities(
     network: PosteriorNetwork, examples: Examples, z_tilde: Float[Array, "b k"]
-) -> tuple[Float[Array, "b"], Float[Array, "b"], Float[Array, "b"]]:
-    """log q of yaw, of (x, y, log-scale) and of z~ for each example. The first two are 0 where the pose is given."""
+) -> tuple[Float[Array, "b"], Float[Array, "b"], Float[Array, "b"], Float[Array, "b"]]:
+    """log q of yaw, of (x, y, log-scale), of z~ and of the kind for each example.
 
-    def one(picture: EncoderPicture, sigma, given, yaw, pose, z):
+    The first two are 0 where the pose is given.
+    """
+
+    def one(picture: EncoderPicture, sigma, given, yaw, pose, z, kind):
         features = network.features(picture, sigma, given=given)
         parts = network.log_density_parts(features, yaw[None], pose[None], z[None])
-        return tuple(part[0] for part in parts)
+        return *(part[0] for part in parts), features.log_kinds[kind]
 
     seen = examples.picture
     seen = replace(
@@ -64,8 +67,9 @@ def log_densities(
         distance=seen.distance.astype(jnp.float32),
         unknown=seen.unknown.astype(jnp.float32),
     )
-    yaw, pose, shape = jax.vmap(one)(seen, examples.pose_sigma, examples.known, examples.yaw, examples.pose, z_tilde)
-    return (1.0 - examples.known) * yaw, (1.0 - examples.known) * pose, shape
+    told = (examples.pose_sigma, examples.known, examples.yaw, examples.pose, z_tilde, examples.kind)
+    yaw, pose, shape, kind = jax.vmap(one)(seen, *told)
+    return (1.0 - examples.known) * yaw, (1.0 - examples.known) * pose, shape, kind
 
 
 def loss(
@@ -77,8 +81,8 @@ def loss(
     """
     z = examples.mean + examples.sd * jax.random.normal(key, examples.mean.shape)
     z_tilde = z if prior is None else jax.lax.stop_gradient(jax.vmap(lambda one: prior.inverse(one)[0])(z))
-    yaw, pose, shape = (-jnp.mean(part) for part in log_densities(network, examples, z_tilde))
-    return yaw + pose + shape, {"yaw": yaw, "pose": pose, "shape": shape}
+    yaw, pose, shape, kind = (-jnp.mean(part) for part in log_densities(network, examples, z_tilde))
+    return yaw + pose + shape + kind, {"yaw": yaw, "pose": pose, "shape": shape, "kind": kind}
 
 
 @eqx.filter_jit(donate="all-except-first")

@@ -6,13 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
 import node.commands.train
 from node.__main__ import main
 from probnerf.geometry import look_at
-from probnerf.prior.checkpoint import load_prior
+from probnerf.prior.checkpoint import load_prior, load_recognition
+from probnerf.prior.networks import Recognition
 from probnerf.training.pictures import ViewSet
 from probnerf.training.settings import TrainConfig
 from probnerf.training.srn_dataset import NO_RANGE, Instance, write_instance
@@ -24,6 +26,7 @@ class State:
 
     model: Any
     step: int
+    recognition: Any
 
 
 class Trainer:
@@ -42,7 +45,7 @@ class Trainer:
             metrics = {"step": step, "loss": 3.0 / step, "fit": -1.0, "kl": 2.0}
             with (folder / "history.jsonl").open("a") as file:
                 file.write(json.dumps(metrics) + "\n")
-            yield State(model, step), metrics
+            yield State(model, step, Recognition(4, 4, 8, jax.random.key(0))), metrics
             if self.error is not None:
                 raise self.error
 
@@ -72,6 +75,9 @@ def test_the_recipe_is_handed_over_and_the_weights_exported(
     prior = load_prior(folder / "prior.safetensors", preset="tiny")
     assert prior.metadata["seeds"] == [0, 3] and prior.metadata["steps"] == 10
     assert prior.metadata["recipe"]["seed"] == 4 and prior.metadata["revision"]
+    assert load_recognition(folder / "recognition.safetensors", prior).hidden.first.in_features == 4
+    learnt = json.loads((folder / "learnt.json").read_text())
+    assert learnt == {"objects": 3, "household": 0, "variants": 8, "meshes": []}
     assert (folder / "curves.png").stat().st_size > 1000
     said = capsys.readouterr().out
     assert str(folder / "curves.png") in said and "farside bench prior --prior" in said

@@ -1,7 +1,10 @@
 """Training pictures show the object that their description tells, where their pose says."""
 
+import os
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
@@ -10,9 +13,10 @@ for library in ("igl", "embreex", "manifold3d"):
     pytest.importorskip(library)
 
 from perception.simulation.examples import ExampleDraws  # noqa: E402
-from perception.simulation.training_pictures import PicturePart, draw_part  # noqa: E402
+from perception.simulation.training_pictures import PicturePart, draw_part, draw_parts, picture_set  # noqa: E402
 from perception.simulation.view_draws import ViewDraws  # noqa: E402
 from probnerf.geometry import pinhole_rays  # noqa: E402
+from probnerf.prior.networks import Recognition  # noqa: E402
 from probnerf.training.learnt_objects import HOUSEHOLD, TABLETOP, Families  # noqa: E402
 from probnerf.training.shape_set import CLIP, DESCRIPTION, GRID  # noqa: E402
 from probnerf.types import Pose  # noqa: E402
@@ -51,3 +55,24 @@ def test_a_part_survives_its_file(part: PicturePart, tmp_path: Path) -> None:
     again = PicturePart.load(tmp_path / "a.npz")
     np.testing.assert_array_equal(again.distance, part.distance)
     np.testing.assert_array_equal(again.description, part.description)
+
+
+@pytest.mark.slow
+def test_parts_are_drawn_once_and_become_a_set_with_recognised_latents(tmp_path: Path) -> None:
+    families = Families(tabletop=range(8), tabletop_share=0.0, household=range(8), household_variants=1)
+
+    def drawn(numbers: range) -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in draw_parts(tmp_path, numbers, families, 16, 2, 2, 1)}
+
+    first = drawn(range(1))
+    both = drawn(range(2))
+    assert first.items() <= both.items() and len(both) == 2
+    assert "JAX_PLATFORMS" in os.environ and os.environ.get("OMP_NUM_THREADS") != "1"
+    parts = [PicturePart.load(path) for path in sorted(both)]
+    recognition = Recognition(DESCRIPTION, 3, 8, jax.random.key(0))
+    pictures = picture_set(parts, recognition)
+    assert len(pictures) == sum(len(part.rgb) for part in parts)
+    mean, precision = recognition(jnp.asarray(parts[1].description[parts[1].row[-1]], jnp.float32))
+    np.testing.assert_allclose(pictures.mean[-1], mean, atol=1e-5)
+    np.testing.assert_allclose(pictures.sd[-1], precision**-0.5, rtol=1e-5)
+    assert pictures.kind[-1] == parts[1].kind[parts[1].row[-1]]

@@ -35,6 +35,7 @@ def pictures() -> PictureSet:
         mean=rng.normal(size=(COUNT, 3)).astype(np.float32),
         sd=np.zeros((COUNT, 3), np.float32),
         object_id=np.arange(COUNT) // 2,
+        kind=np.arange(COUNT, dtype=np.uint8) % 3,
     )
 
 

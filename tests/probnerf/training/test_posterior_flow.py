@@ -1,7 +1,7 @@
 """Training of the posterior network, in a world whose exact posterior is known.
 
 A picture shows, as colours, with noise: the first two latents turned by the yaw; the direction of twice the yaw (so two
-opposite yaws fit equally well); and x. The third latent, y and the scale are not seen.
+opposite yaws fit equally well); and x. The third latent, y and the scale are not seen. The kind is the sign of x.
 """
 
 import json
@@ -60,12 +60,13 @@ def toy(count: int, seed: int) -> tuple[PictureSet, np.ndarray]:
         mean=z.astype(np.float32),
         sd=np.zeros((count, 3), np.float32),
         object_id=np.arange(count),
+        kind=(pose[:, 0] > 0.0).astype(np.uint8),
     )
     return pictures, shown
 
 
-def exact(pictures: PictureSet, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Logarithms of the exact posterior of yaw, of x, y and scale, and of z~, at each picture's latents."""
+def exact(pictures: PictureSet, shown: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Logarithms of the exact posterior of yaw, of (x, y, scale), of z~ and of the kind, at each picture's latents."""
     gain = 1.0 / (1.0 + NOISE**2)
     sd = np.sqrt(NOISE**2 * gain)
     kappa = np.hypot(shown[:, 2], shown[:, 3]) / YAW_NOISE**2
@@ -74,7 +75,8 @@ def exact(pictures: PictureSet, shown: np.ndarray) -> tuple[np.ndarray, np.ndarr
     pose = stats.norm.logpdf(pictures.pose[:, 0], gain * shown[:, 4], sd)
     pose += stats.norm.logpdf(pictures.pose[:, 1:3]).sum(axis=1)
     z = stats.norm.logpdf(pictures.mean[:, :2], gain * _turned(-pictures.yaw, shown[:, :2]), sd).sum(axis=1)
-    return yaw, pose, z + stats.norm.logpdf(pictures.mean[:, 2])
+    kind = stats.norm.logcdf((2.0 * pictures.kind - 1.0) * gain * shown[:, 4] / sd)
+    return yaw, pose, z + stats.norm.logpdf(pictures.mean[:, 2]), kind
 
 
 @pytest.mark.slow
@@ -94,7 +96,7 @@ def test_a_trained_network_is_the_exact_posterior(tmp_path: Path) -> None:
     plain = changed(pictures, np.arange(count), np.random.default_rng(0), config)
     examples = jax.device_put(plain)
     found = eqx.filter_jit(log_densities)(state.average, examples, examples.mean)
-    for name, p, q in zip(("yaw", "pose", "z"), exact(pictures, shown), found, strict=True):
+    for name, p, q in zip(("yaw", "pose", "z", "kind"), exact(pictures, shown), found, strict=True):
         divergence = p - np.asarray(q, np.float64)
         print(name, divergence.mean(), divergence.std() / np.sqrt(count))
         assert -0.02 < divergence.mean() < 0.03, name
@@ -151,7 +153,9 @@ def test_a_given_pose_leaves_only_the_shape(tmp_path: Path) -> None:
     examples = jax.device_put(changed(toy(8, 0)[0], np.arange(8), np.random.default_rng(0), config))
     network = shaken()
     value, parts = eqx.filter_jit(loss)(network, examples, jax.random.key(0))
-    assert parts["yaw"] == 0.0 and parts["pose"] == 0.0 and value == parts["shape"]
+    assert (
+        parts["yaw"] == 0.0 and parts["pose"] == 0.0 and float(value) == pytest.approx(parts["shape"] + parts["kind"])
+    )
     flow = RealNVP(3, 4, jax.random.key(0))  # untrained: it permutes
     told = eqx.tree_at(lambda e: e.mean, examples, jax.vmap(lambda z: flow.forward(z)[0])(examples.mean))
     assert float(eqx.filter_jit(loss)(network, told, jax.random.key(0), flow)[0]) == pytest.approx(

@@ -1,0 +1,87 @@
+"""Training a prior's posterior network: pictures of what the prior learnt, the run, the weights."""
+
+import json
+import os
+import zlib
+from dataclasses import asdict
+from pathlib import Path
+
+import jax
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from node.commands.options import NetworkTraining
+from node.commands.train import (
+    TABLETOP_SHARE,
+    drawn_curves,
+    household_variants,
+    learnt_objects,
+    require_mesh_libraries,
+    revision,
+)
+from probnerf.objects.tabletop import TRAIN_SEEDS
+from probnerf.prior.checkpoint import load_prior, load_recognition, network_path, save_posterior_network
+from probnerf.prior.posterior_flow import NetworkSizes, PosteriorNetwork
+from probnerf.training import posterior_flow as training
+
+
+def train_network(options: NetworkTraining, out: Console, err: Console) -> bool:
+    """Train, or continue an earlier run of the same recipe. False after Ctrl-C.
+
+    Raises FileNotFoundError if the run has no finished prior, ValueError if its network was trained by another recipe,
+    FloatingPointError if the loss is not finite.
+    """
+    require_mesh_libraries()
+    # only here: it needs them
+    from perception.simulation.training_pictures import OBJECTS, VIEWS, PicturePart, draw_parts, picture_set
+    from probnerf.training.learnt_objects import Families
+
+    prior_file, folder = options.run / "prior.safetensors", options.run / "network"
+    prior = load_prior(prior_file)
+    recognition = load_recognition(options.run / "recognition.safetensors", prior)
+    learnt = learnt_objects(options.run)
+    families = Families(
+        tabletop=TRAIN_SEEDS[: learnt["objects"]],
+        tabletop_share=TABLETOP_SHARE,
+        household=TRAIN_SEEDS[: learnt["household"]],
+        household_variants=household_variants(learnt["variants"]),
+        folders=tuple(Path(folder) for folder in learnt["meshes"]),
+        folder_variants=learnt["variants"],
+    )
+    told = zlib.crc32(json.dumps([learnt, options.image_size], sort_keys=True).encode())
+    size = NetworkSizes(latent=prior.model.latent, image_size=options.image_size)
+    count = max(1, round(options.pictures / (OBJECTS * VIEWS)))
+    processes = options.processes or os.cpu_count() or 1
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    state = None
+    try:
+        with (
+            Progress(*columns, TimeRemainingColumn(), console=err, disable=not err.is_terminal) as progress,
+            drawn_curves(folder, out),
+        ):
+            drawing = progress.add_task("pictures", total=count * OBJECTS * VIEWS)
+            files = []
+            for path in draw_parts(
+                options.run / f"pictures-{told:08x}", range(count), families, size.image_size, processes
+            ):
+                files.append(path)
+                progress.update(drawing, completed=len(files) * OBJECTS * VIEWS)
+            pictures = picture_set([PicturePart.load(path) for path in sorted(files)], recognition)
+            network = PosteriorNetwork(size, jax.random.key(options.recipe.seed))
+            steps = progress.add_task("steps", total=options.recipe.steps)
+            for state, metrics in training.train(  # noqa: B007
+                network, pictures, options.recipe, folder, prior.model.flow
+            ):
+                text = "steps  " + "  ".join(f"{k} {v:.4g}" for k, v in metrics.items() if k != "step")
+                progress.update(steps, completed=int(metrics["step"]), description=text)
+    except KeyboardInterrupt:
+        out.print("stopped; the same command continues from the last checkpoint", highlight=False)
+        return False
+    if state is None:
+        out.print(f"{folder} is trained already", highlight=False, soft_wrap=True)
+        return True
+    story = {"recipe": asdict(options.recipe), "pictures": len(pictures), "revision": revision()}
+    weights = network_path(prior_file)
+    save_posterior_network(weights, state.average, prior.hash, story)
+    out.print(f"{weights}; every command that reads {prior_file} uses it now", highlight=False, soft_wrap=True)
+    return True
