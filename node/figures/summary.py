@@ -21,13 +21,20 @@ def hidden_volume(h: Hypotheses) -> tuple[float, Float[np.ndarray, "3"]]:
 
 
 def answer(s: Summary) -> str:
-    """What a robot's user acts on, in one line: size, chance of a hidden part, next view."""
+    """What a robot's user acts on, in one line: what it is, size, chance of a hidden part, next view."""
     width, depth, height = 100.0 * s.size_m
     chance = f"{s.p_sticks_out:.0%}" if s.p_sticks_out >= s.p_least else f"less than {s.p_least:.0%}"
     return (
-        f"about {width:.0f} × {depth:.0f} × {height:.0f} cm (width, depth, height); {chance} chance that an unseen "
-        f"part reaches more than {100.0 * MARGIN_M:.0f} cm beyond what was seen; {_advice(s.next_view)}"
+        f"{_kinds(s)}about {width:.0f} × {depth:.0f} × {height:.0f} cm (width, depth, height); {chance} chance that "
+        f"an unseen part reaches more than {100.0 * MARGIN_M:.0f} cm beyond what was seen; {_advice(s.next_view)}"
     )
+
+
+def _kinds(s: Summary) -> str:
+    """`vessel 80%, other 20%; `, the likeliest first; empty where nothing tells what it is."""
+    likely = sorted(s.kinds.items(), key=lambda item: -item[1])
+    named = ", ".join(f"{name} {p:.0%}" for i, (name, p) in enumerate(likely) if i == 0 or p >= 0.005)
+    return f"{named}; " if named else ""
 
 
 def _advice(view: Direction | None) -> str:

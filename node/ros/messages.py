@@ -275,6 +275,8 @@ def hypotheses_message(h: Hypotheses, method: str = "") -> Any:
         inside_view=bool(h.inside_view),
         seed=int(h.seed),
         prior_hash=h.prior_hash,
+        kind_names=list(h.kinds),
+        kind_probabilities=np.array(list(h.kinds.values()), np.float64),
         diagnostic_names=list(numbers),
         diagnostic_values=np.array(list(numbers.values()), np.float64),
     )
@@ -289,9 +291,8 @@ def hypotheses_from(message: Any) -> Hypotheses:
             raise ValueError(
                 f"{name} has {len(getattr(m, name))} entries; {count} hypotheses of {grid} voxels a side need {want}"
             )
-    names, values = m.diagnostic_names, np.asarray(m.diagnostic_values).tolist()
-    if len(names) != len(values):
-        raise ValueError(f"there are {len(names)} diagnostic_names but {len(values)} diagnostic_values")
+    diagnostics = _named(m, "diagnostic_names", "diagnostic_values")
+    kinds = _named(m, "kind_names", "kind_probabilities")
     return Hypotheses(
         stamp_ns=m.header.stamp.sec * 1_000_000_000 + m.header.stamp.nanosec,
         frame_id=m.header.frame_id,
@@ -318,6 +319,15 @@ def hypotheses_from(message: Any) -> Hypotheses:
         monte_carlo_error=m.monte_carlo_error,
         prior_hash=m.prior_hash,
         seed=m.seed,
-        diagnostics=AnswerDiagnostics.from_mapping(dict(zip(names, values, strict=True))),
+        diagnostics=AnswerDiagnostics.from_mapping(diagnostics),
         result=StopReason(m.result),
+        kinds=kinds,
     )
+
+
+def _named(message: Any, names: str, values: str) -> dict[str, float]:
+    """Two of its arrays as a mapping. Raises ValueError where one is longer."""
+    keys, numbers = getattr(message, names), np.asarray(getattr(message, values)).tolist()
+    if len(keys) != len(numbers):
+        raise ValueError(f"there are {len(keys)} {names} but {len(numbers)} {values}")
+    return dict(zip(keys, numbers, strict=True))

@@ -6,7 +6,8 @@ in metres.
 """
 
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
@@ -47,6 +48,7 @@ class Hypotheses:
     seed: int
     diagnostics: AnswerDiagnostics
     result: StopReason  # the sampler's (`Posterior.result`), or why the controller made no further run
+    kinds: Mapping[str, float] = field(default_factory=dict)  # probabilities of what it is (`KINDS`); empty: not known
 
     def __post_init__(self) -> None:
         shape = self.opacity.shape
@@ -67,6 +69,8 @@ class Hypotheses:
             raise ValueError(f"plane is {np.asarray(plane).tolist()}; it must be four finite numbers")
         if not 0 < half_extent < np.inf:
             raise ValueError(f"half_extent is {half_extent}; it must be more than 0 m")
+        if self.kinds and not (min(self.kinds.values()) >= 0 and abs(sum(self.kinds.values()) - 1.0) < 1e-3):
+            raise ValueError(f"kinds are {dict(self.kinds)}; they must not be negative and must sum to 1")
         if not np.isfinite(self.pose).all():
             raise ValueError("a pose is not finite")
         if not (np.all(self.weights >= 0) and abs(float(np.sum(self.weights)) - 1.0) < 1e-6):

@@ -57,6 +57,7 @@ def save(path: str | Path, hypotheses: Hypotheses) -> None:
         "seed": int(h.seed),
         "diagnostics": h.diagnostics.as_mapping(),
         "result": h.result,
+        "kinds": {name: float(p) for name, p in h.kinds.items()},
     }
     arrays = {
         "header": np.frombuffer(json.dumps(header, sort_keys=True).encode(), np.uint8),
@@ -179,4 +180,5 @@ def _from_file(header: dict, arrays: dict[str, np.ndarray]) -> Hypotheses:
         seed=header["seed"],
         diagnostics=AnswerDiagnostics.from_mapping(header["diagnostics"]),
         result=StopReason(header["result"]),
+        kinds=header.get("kinds", {}),  # files before these had none
     )

@@ -1,6 +1,7 @@
 """Summary of an object: its size, whether a hidden part sticks out, and where to look next."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -36,6 +37,7 @@ class Summary:
     p_sticks_out_se: float  # its Monte Carlo standard error
     p_least: float  # rule of succession: least probability that the number of hypotheses supports
     next_view: Direction | None  # None: no view has enough expected gain
+    kinds: Mapping[str, float] = field(default_factory=dict)  # probabilities of what it is; empty: not known
 
 
 def summarise(h: Hypotheses) -> Summary:
@@ -44,7 +46,7 @@ def summarise(h: Hypotheses) -> Summary:
     if h.out_of_model:  # as in a query: with this weight all that was not seen is occupied
         p, se = (1 - CAUTION) * p + CAUTION, (1 - CAUTION) * se
     witnesses = 1.0 if h.alone else h.effective_hypotheses
-    return Summary(size(h), float(p), float(se), 1.0 / (witnesses + 2.0), next_view(h))
+    return Summary(size(h), float(p), float(se), 1.0 / (witnesses + 2.0), next_view(h), h.kinds)
 
 
 def size(h: Hypotheses) -> Float[np.ndarray, "3"]:

@@ -222,4 +222,4 @@ class _Publisher:
                 sampler.view, posterior, sampler.likelihood, sampler.prior, config, sampler.seed,
                 point_gradients=sampler.point_gradients, evidence_power=evidence_power,
             )  # fmt: skip
-        return replace(h, stage=max(sampler.stages, h.stage))
+        return replace(h, stage=max(sampler.stages, h.stage), kinds=sampler.kinds)

@@ -7,6 +7,7 @@ from functools import cached_property
 from threading import RLock
 
 import jax
+import numpy as np
 from jaxtyping import Array
 
 from perception.inference.limits import Limits
@@ -16,6 +17,7 @@ from perception.observation.encoder_crop import crop
 from probnerf.inference import asks_encoder, crossings_of, encoder_guess, infer, likelihood_of, modes_of, sampler_of
 from probnerf.likelihood.settings import Likelihood
 from probnerf.network_start import defensive, network_guess, network_used, picture_density, weigh_draws
+from probnerf.objects.shape_kinds import KINDS
 from probnerf.prior.checkpoint import Prior
 from probnerf.prior.networks import ProbNeRF
 from probnerf.prior.posterior_flow import PictureDensity
@@ -104,6 +106,14 @@ class ViewSampler:
         if view.pose_known or view.frame.depth is None or not isinstance(model, ProbNeRF):
             return None
         return crop(view.frame, view.segment, view.object_frame, model.preset.image_size)
+
+    @cached_property
+    def kinds(self) -> dict[str, float]:
+        """What kind of thing it is: the network's probabilities, by name; empty if there is no network."""
+        if self._density is None:
+            return {}
+        p = np.exp(np.asarray(self._density.features.log_kinds, np.float64))
+        return dict(zip(KINDS, (p / p.sum()).tolist(), strict=True))
 
     @property
     def _key(self) -> Array:

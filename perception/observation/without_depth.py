@@ -93,7 +93,8 @@ def standing_body(
     about the camera, which no pixel can detect. `sight_sigma` is its standard deviation.
 
     If the foot's outline is not an arc, the body is not one of revolution: its width is visible, its depth hardly.
-    Raises `ValueError` if the foot is hidden or above the horizon, or seen too steeply or too flatly.
+    Raises `ValueError` if the foot is hidden or above the horizon, or seen too steeply or too flatly, or if the middle
+    is not seen.
     """
     up, h = plane[:3], float(plane[3])
     v, u = np.nonzero(mask)
@@ -111,6 +112,10 @@ def standing_body(
     phi -= axis
     alpha = float(np.percentile(np.minimum(axis - low, high - axis), 90))  # and over one side alone
     central = np.abs(phi) < 0.35 * alpha
+    if not central.any():
+        raise ValueError(
+            "nothing of it is seen about its middle, which shows its height without depth: move the camera"
+        )
     top, bottom = (float(np.median(end)) for end in _ends(slope[central], phi[central], 7))
     at_bottom = central & (slope > bottom - 0.1 * (bottom - top))
     if covered[at_bottom].mean() > 0.5:

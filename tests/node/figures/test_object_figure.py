@@ -150,4 +150,6 @@ def test_the_answer_is_a_sentence_to_act_on() -> None:
     )
     assert "; less than 2% chance" in answer(replace(summary, p_sticks_out=0.0))
     assert answer(replace(summary, next_view=Direction("back", True, 0.4))).endswith("from above and behind")
+    what = {"vessel": 0.012, "box": 0.004, "other": 0.984}
+    assert answer(replace(summary, kinds=what)).startswith("other 98%, vessel 1%; about")
     assert answer(replace(summary, next_view=None)).endswith("another view would tell little")

@@ -59,6 +59,7 @@ def _hypotheses(opacity: np.ndarray, weights: list[float], **changes) -> Hypothe
         seed=17,
         diagnostics=AnswerDiagnostics(ess=12.5),
         result=StopReason.STAGES,
+        kinds={"vessel": 0.75, "box": 0.25},
     )
     return replace(h, **changes)
 

@@ -98,6 +98,16 @@ def test_what_a_silhouette_cannot_tell_is_named() -> None:
         standing_body(CAMERA, picture(CAN, T=flat).label == 1, NOTHING, true_plane(flat), (0.05, np.radians(3.0)))
 
 
+def test_a_body_whose_middle_is_hidden_is_refused() -> None:
+    """Two strips at the sides of what stands behind a post."""
+    camera = Camera(320, 240, np.array([[300.0, 0, 160], [0, 300.0, 120], [0, 0, 1]]), np.zeros(5))
+    mask = np.zeros((240, 320), bool)
+    mask[140:200, 60:70] = mask[140:200, 250:260] = True
+    plane = np.array([0.0, -1.0, 0.0, 0.3])
+    with pytest.raises(ValueError, match="nothing of it is seen about its middle"):
+        standing_body(camera, mask, np.zeros_like(mask), plane, (0.0, 0.0))
+
+
 def test_free_pixels_end_on_the_plane() -> None:
     T = looking_down(10.0)
     status = np.full((240, 320), FREE)
