@@ -113,13 +113,13 @@ def main(options: Options) -> Summary:
         results,
         options,
         lambda: _measure(options, prior, results),
-        lambda: summary(newest(results.lines, prior.hash, options.seed), options),
+        lambda: summary(newest(results.lines, prior.identity, options.seed), options),
     )
 
 
 def _measure(options: Options, prior: Prior, results: Results) -> None:
     config, rivals, seed = ControllerConfig(), RivalConfig(), options.seed
-    common = {"prior": prior.hash, "seed": seed}
+    common = {"prior": prior.identity, "seed": seed}
     settings = _settings(config, rivals, options.quick)
     rates = {k: base_rate(128 if options.quick else 1024, config=config.observe, pose_known=k) for k in (False, True)}
     conditions = selected(options.conditions, list(SORTS), "condition")

@@ -113,7 +113,7 @@ def main(options: Options) -> Summary:
         results,
         options,
         lambda: _measure(options, prior, results),
-        lambda: summary(newest(results.lines, prior.hash, options.seed), options),
+        lambda: summary(newest(results.lines, prior.identity, options.seed), options),
     )
 
 
@@ -121,7 +121,7 @@ def _measure(options: Options, prior: Prior, results: Results) -> None:
     config = ControllerConfig()
     for number, picture in enumerate(faultless_pictures(options.n), start=1):
         view = vessel_view(picture)
-        common = {"prior": prior.hash, "condition": CONDITION, "object": view.seed, "seed": options.seed}
+        common = {"prior": prior.identity, "condition": CONDITION, "object": view.seed, "seed": options.seed}
         for method in options.compared:
             line: Line = {**common, "method": method.name, "settings": settings_of(method, config)}
             if line in results:

@@ -92,7 +92,7 @@ def main(options: Options) -> Summary:
         results,
         options,
         lambda: _measure(options, prior, results),
-        lambda: summary(newest(results.lines, prior.hash, options.seed), options),
+        lambda: summary(newest(results.lines, prior.identity, options.seed), options),
     )
 
 
@@ -111,7 +111,7 @@ def _measure(options: Options, prior: Prior, results: Results) -> None:
     for number in TEST_SEEDS:
         if vessels == options.n:
             break
-        common = {"prior": prior.hash, "object": number, "seed": options.seed}
+        common = {"prior": prior.identity, "object": number, "seed": options.seed}
         missing = [
             {"method": m.name, "settings": settings_of(m, config), "condition": c, **common}
             for c in conditions

@@ -120,13 +120,13 @@ def main(options: Options) -> Summary:
         results,
         options,
         lambda: _measure(options, prior, results),
-        lambda: summary(newest(results.lines, prior.hash, options.seed), options),
+        lambda: summary(newest(results.lines, prior.identity, options.seed), options),
     )
 
 
 def _measure(options: Options, prior: Prior, results: Results) -> None:
     config = ControllerConfig()
-    common = {"prior": prior.hash, "condition": BEHIND, "seed": options.seed}
+    common = {"prior": prior.identity, "condition": BEHIND, "seed": options.seed}
     alone = {**common, "method": PRIOR, "settings": {"shapes": PRIOR_SHAPES}, "object": "any"}
     if alone not in results:
         drawn = jax.random.normal(jax.random.key(0), (PRIOR_SHAPES, prior.model.latent))

@@ -97,13 +97,13 @@ def main(options: Options) -> Summary:
         results,
         options,
         lambda: _measure(options, prior, results),
-        lambda: summary(newest(results.lines, prior.hash, options.seed), options),
+        lambda: summary(newest(results.lines, prior.identity, options.seed), options),
     )
 
 
 def _measure(options: Options, prior: Prior, results: Results) -> None:
     config, found = ControllerConfig(), 0
-    common = {"prior": prior.hash, "seed": options.seed, "condition": CONDITION}
+    common = {"prior": prior.identity, "seed": options.seed, "condition": CONDITION}
     common["settings"] = {"digest": digest(asdict(config), options.quick)}
     rate = base_rate(128 if options.quick else 1024, config=config.observe)
     for number in TEST_SEEDS[FIRST:]:

@@ -75,14 +75,14 @@ def main(options: Options) -> Summary:
         results,
         options,
         lambda: _measure(options, prior, results),
-        lambda: summary(newest(results.lines, prior.hash, options.seed), options),
+        lambda: summary(newest(results.lines, prior.identity, options.seed), options),
     )
 
 
 def _measure(options: Options, prior: Prior, results: Results) -> None:
     config = ControllerConfig()
     settings = {"digest": digest(asdict(config), options.quick)}
-    common = {"prior": prior.hash, "method": METHOD, "settings": settings, "seed": options.seed}
+    common = {"prior": prior.identity, "method": METHOD, "settings": settings, "seed": options.seed}
     views = list(_views(options.n, options.noise, options.meshes))  # before what takes long: without meshes it raises
     rate = base_rate(128 if options.quick else 1024, config=config.observe)
     for condition, name, make in views:

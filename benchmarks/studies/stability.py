@@ -115,7 +115,7 @@ def main(options: Options) -> Summary:
         results,
         options,
         lambda: _measure(options, prior, results),
-        lambda: summary(newest(results.lines, prior.hash), options),
+        lambda: summary(newest(results.lines, prior.identity), options),
     )
 
 
@@ -125,7 +125,7 @@ def _condition(axis: Axis, amount: float) -> str:
 
 def _measure(options: Options, prior: Prior, results: Results) -> None:
     settings = {"digest": digest(asdict(ControllerConfig()), options.quick)}
-    same = {"prior": prior.hash, "method": METHOD, "settings": settings}
+    same = {"prior": prior.identity, "method": METHOD, "settings": settings}
     rate, views = base_rate(128 if options.quick else 1024), faultless_pictures(options.n)
     for axis in options.chosen:
         for amount in axis.amounts:

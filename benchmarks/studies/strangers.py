@@ -9,8 +9,9 @@ not enter. Points are uniform in the object's box enlarged by 3 cm, above the ta
 depth; which are occupied, the generalised winding number says.
 
 Methods: the hypotheses alone (*tempered_smc*), the same as a query answers them, which is with caution where the answer
-is flagged, and a Bayesian Hilbert map as V-PRISM makes it (*hilbert_map*, with its published numbers). To answer one
-half everywhere scores 0.693.
+is flagged, and a Bayesian Hilbert map as V-PRISM makes it (*hilbert_map*, with its published numbers); and, of a prior
+with a posterior network, the first answer, which is the network's alone (*first answer*). To answer one half everywhere
+scores 0.693.
 
 - log_score: mean -log of the probability of a point's truth. balanced: half the mean -log p over occupied points and
   half the mean -log(1 - p) over free ones, p clipped to 0.001 ... 0.999. Both are means over objects.
@@ -45,6 +46,7 @@ from benchmarks.harness.tables import Table, gated, ranged
 from benchmarks.measures.point_scores import point_scores, pooled_ece
 from benchmarks.rivals.hilbert_map import HilbertMapConfig, hilbert_map
 from benchmarks.scenes.strangers import BULLET, DATA, GSO, StrangerConfig, files, hidden_points, stranger
+from perception.answers.hypotheses import Hypotheses
 from perception.answers.query import query
 from perception.answers.regions import Points
 from perception.inference.controller import estimate
@@ -53,7 +55,9 @@ from perception.observation.segmentation import Segment, segment
 from perception.sources.frame import Frame
 from probnerf.prior.checkpoint import Prior, load_prior
 
-ALONE, QUERIED, RIVAL = METHODS = ("tempered_smc", "tempered_smc, as queried", "hilbert_map")
+ALONE, QUERIED, RIVAL = ALWAYS = ("tempered_smc", "tempered_smc, as queried", "hilbert_map")
+FIRST = "first answer"
+METHODS = (*ALWAYS, FIRST)
 SETS = {"gso": GSO, "bullet": BULLET}
 DONT_KNOW = float(np.log(2.0))  # nats; what one half everywhere scores
 BEFORE = "before"  # the method's name in rows of an older file
@@ -88,7 +92,7 @@ def main(options: Options) -> Summary:
         results,
         options,
         partial(_measure, options, prior, results),
-        lambda: summary(newest(results.lines, prior.hash, options.seed), options),
+        lambda: summary(newest(results.lines, prior.identity, options.seed), options),
     )
 
 
@@ -98,11 +102,13 @@ def _measure(options: Options, prior: Prior, results: Results) -> None:
     ours = {"digest": digest([asdict(config), asdict(scene)], options.quick), **limit}
     rival = {"digest": digest([asdict(map_config), asdict(scene)], options.quick)}
     settings = {ALONE: ours, QUERIED: ours, RIVAL: rival}
+    if prior.network is not None:
+        settings[FIRST] = ours
     names = list(SETS) if options.set == "both" else [options.set]
     for name in names:
         for path in files(SETS[name], options.data)[: options.n]:
-            common = {"prior": prior.hash, "condition": SETS[name], "object": path.stem, "seed": options.seed}
-            lines = {method: {**common, "method": method, "settings": settings[method]} for method in METHODS}
+            common = {"prior": prior.identity, "condition": SETS[name], "object": path.stem, "seed": options.seed}
+            lines = {method: {**common, "method": method, "settings": own} for method, own in settings.items()}
             if all(line in results for line in lines.values()):
                 continue
             for method, told in _answers(path, prior, config, map_config, scene, options).items():
@@ -124,14 +130,14 @@ def _answers(
     try:
         found = segment(seen.frame, 1)[0]
     except ValueError as error:
-        return {method: {"refused": str(error)} for method in METHODS}
+        return {method: {"refused": str(error)} for method in (*ALWAYS, *_network_methods(prior))}
     begun = time.monotonic()
     smooth = hilbert_map(seen.frame, found, map_config).p_occupied(points)
     seconds = round(time.monotonic() - begun, 2)
     try:
         answered = _of_perception(seen.frame, found, points, occupied, prior, config, options)
     except ValueError as error:
-        answered = {method: {"refused": str(error)} for method in (QUERIED, ALONE)}
+        answered = {method: {"refused": str(error)} for method in (QUERIED, ALONE, *_network_methods(prior))}
     return {**answered, RIVAL: {**_told(smooth, occupied), "seconds": seconds}}
 
 
@@ -144,7 +150,15 @@ def _of_perception(
     config: ControllerConfig,
     options: Options,
 ) -> dict[str, dict[str, Any]]:
-    """The hypotheses' answer by the public query, before any alarm's caution and with it."""
+    """The hypotheses' answer by the public query, before any alarm's caution and with it, and a network's."""
+    answers: list[Hypotheses] = []
+    first = time.monotonic()
+    seconds: list[float] = []
+
+    def keep(h: Hypotheses) -> None:
+        answers.append(h)
+        seconds.append(round(time.monotonic() - first, 2))
+
     made = estimate(
         frame,
         found,
@@ -153,6 +167,7 @@ def _of_perception(
         seed=options.seed,
         budget_s=options.budget_s or None,
         stages=None if options.budget_s else options.stages,
+        on_answer=keep if prior.network is not None else None,
     )
     h, checks = made.hypotheses, made.hypotheses.diagnostics
     beyond = h.voxels("camera", *points[occupied].T) < 0
@@ -166,8 +181,18 @@ def _of_perception(
         "seconds": round(made.seconds, 2),
     }
     given = {QUERIED: h, ALONE: replace(h, out_of_model=False)}
-    asked = {method: query([g], Points(points), "camera", now_ns=g.stamp_ns).p_occupied for method, g in given.items()}
-    return {method: {**_told(np.array(p), occupied), **state} for method, p in asked.items()}
+    told = {method: {**_asked(g, points, occupied), **state} for method, g in given.items()}
+    if prior.network is not None:
+        told[FIRST] = {**_asked(replace(answers[0], out_of_model=False), points, occupied), "seconds": seconds[0]}
+    return told
+
+
+def _network_methods(prior: Prior) -> tuple[str, ...]:
+    return () if prior.network is None else (FIRST,)
+
+
+def _asked(h: Hypotheses, points: Float[np.ndarray, "n 3"], occupied: Bool[np.ndarray, "n"]) -> dict[str, Any]:
+    return _told(np.array(query([h], Points(points), "camera", now_ns=h.stamp_ns).p_occupied), occupied)
 
 
 def _told(p: Float[np.ndarray, "n"], occupied: Bool[np.ndarray, "n"]) -> dict[str, Any]:

@@ -10,11 +10,24 @@ import trimesh
 from benchmarks.harness.intervals import Figures
 from benchmarks.harness.results import Results
 from benchmarks.measures.point_scores import point_scores
-from benchmarks.studies.strangers import ALONE, BEFORE, BULLET, GSO, METHODS, QUERIED, RIVAL, Options, main, summary
+from benchmarks.studies.strangers import (
+    ALONE,
+    ALWAYS,
+    BEFORE,
+    BULLET,
+    FIRST,
+    GSO,
+    METHODS,
+    QUERIED,
+    RIVAL,
+    Options,
+    main,
+    summary,
+)
 from probnerf.prior.checkpoint import load_prior
 
 OCCUPIED = np.array([True, True, False, False])
-P = {ALONE: [0.9, 0.8, 0.01, 0.2], QUERIED: [0.9, 0.9, 0.4, 0.4], RIVAL: [0.6, 0.6, 0.4, 0.4]}
+P = {ALONE: [0.9, 0.8, 0.01, 0.2], QUERIED: [0.9, 0.9, 0.4, 0.4], RIVAL: [0.6, 0.6, 0.4, 0.4], FIRST: [0.5] * 4}
 
 
 def line(method: str, name: str, p: list[float], prior: str = "p") -> dict:
@@ -42,7 +55,8 @@ def test_rows_are_summed_up_and_paired() -> None:
     assert of(GSO, ALONE, "better_than_hilbert_map") == 1.0 and of(GSO, ALONE, "free") == 0.25
     assert of(GSO, ALONE, "outside") == pytest.approx(0.1) and np.isnan(of(GSO, RIVAL, "outside"))
     assert (of(GSO, ALONE, "refused"), of.count(GSO, ALONE, "refused")) == (1.0, 4)
-    assert len(found.tables[0].lines) == 3 and "1 of 4 refused" in found.tables[1].lines[-1][0]
+    assert of(GSO, FIRST, "balanced") == pytest.approx(half)
+    assert len(found.tables[0].lines) == 4 and "1 of 4 refused" in found.tables[1].lines[-1][0]
     assert found.picture().axes and summary([], Options()) is None
 
 
@@ -68,7 +82,7 @@ def test_an_object_goes_from_mesh_to_rows_once(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no results"):
         main(options)
     kept = {each["method"]: each for each in Results(options.results).lines}
-    assert set(kept) == set(METHODS) and kept[ALONE]["condition"] == BULLET
+    assert set(kept) == set(ALWAYS) and kept[ALONE]["condition"] == BULLET
     assert "2 cm high" in kept[ALONE]["refused"] and 0.0 < kept[RIVAL]["balanced"] < 2.0
     assert kept[ALONE]["prior"] == load_prior().hash
     size = options.results.stat().st_size
@@ -81,5 +95,5 @@ def test_an_object_goes_from_mesh_to_rows_once(tmp_path: Path) -> None:
 def test_a_scan_is_answered_with_and_without_caution(shared_data: Path, tmp_path: Path) -> None:
     found = main(Options(tmp_path, n=2, stages=10, results=tmp_path / "rows.jsonl", data=shared_data))
     of = Figures(found.rows)
-    assert of.methods(GSO) == list(METHODS) and of.count(GSO, ALONE, "balanced") == 2
-    assert all(0.0 < of(GSO, method, "balanced") < 2.0 for method in METHODS)
+    assert of.methods(GSO) == list(ALWAYS) and of.count(GSO, ALONE, "balanced") == 2
+    assert all(0.0 < of(GSO, method, "balanced") < 2.0 for method in ALWAYS)
