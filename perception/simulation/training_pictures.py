@@ -119,7 +119,7 @@ def draw_parts(
 
 def picture_set(parts: Sequence[PicturePart], recognition: Recognition) -> PictureSet:
     """The parts' pictures with their objects' latents, as recognition tells them."""
-    recognised = eqx.filter_jit(jax.vmap(recognition))
+    recognised = eqx.filter_jit(eqx.filter_vmap(recognition))
     means, sds = [], []
     for part in parts:
         mean, precision = recognised(jnp.asarray(part.description, jnp.float32))
