@@ -1,7 +1,8 @@
 """How well a prior can hold a mesh: z~ is fitted to the true solid, and the solid that it decodes to is compared.
 
 This asks the decoder alone, not the camera: 600 Adam steps on samples of the occupancy (as training draws them) plus
-the log prior, from the best of a few starts. Truth and reconstruction are walls of 64^3 voxels (a voxel of which a
+the log prior, from the shape that recognition tells where it is kept beside the prior, else from the best of a few
+random starts, which end in poorer modes. Truth and reconstruction are walls of 64^3 voxels (a voxel of which a
 corner is in the solid) through the same operator (`occupancy.solid`).
 """
 
@@ -21,7 +22,7 @@ from probnerf.objects.household import draw_mesh
 from probnerf.objects.mesh import MeshObject, read_folder
 from probnerf.objects.shape_kinds import kind_of_name
 from probnerf.objects.tabletop import VALIDATION_SEEDS
-from probnerf.prior.networks import ProbNeRF
+from probnerf.prior.networks import ProbNeRF, Recognition
 from probnerf.rendering import foam
 from probnerf.rendering.occupancy import solid
 from probnerf.sampling.ascent import ascend
@@ -60,14 +61,19 @@ def held_out_things(count: int, folders: dict[str, tuple[Path, bool]]) -> Iterat
                 yield source, *variant(mesh, name, kind_of_name(name), 0)
 
 
-def refit(model: ProbNeRF, source: str, thing: MeshObject, seed: int) -> Refitted:
+def refit(
+    model: ProbNeRF, source: str, thing: MeshObject, seed: int, recognition: Recognition | None = None
+) -> Refitted:
     """Fit and judge one object."""
     shapes = sample_mesh(thing, seed, paints=1)
     rng = np.random.default_rng([seed, 19])
     drawn = [batch_of(shapes, rng, np.zeros(1, int), _POINTS, 1) for _ in range(_STEPS)]
     batches = tuple(jnp.asarray(np.concatenate([getattr(b, name) for b in drawn])) for name in ("points", "inside"))
-    starts = jnp.asarray(0.5 * rng.standard_normal((_STARTS, model.latent)), jnp.float32)
-    q, values = ascend(_log_posterior, model, starts, AdamConfig(_STEPS, 0.05, 0.002), batches)
+    starts, rate = jnp.asarray(0.5 * rng.standard_normal((_STARTS, model.latent)), jnp.float32), 0.05
+    if recognition is not None:
+        z = recognition(batch_of(shapes, rng, np.zeros(1, int), 4, 1).description[0])[0]
+        starts, rate = model.flow.inverse(z)[0][None], 0.02
+    q, values = ascend(_log_posterior, model, starts, AdamConfig(_STEPS, rate, 0.002), batches)
     best = q[np.argmax(np.asarray(values[-20:]).mean(axis=0))]
     likelihood = Likelihood(lattice=foam.Lattice(32, 1.1), sample_pose=False)
     grids = opacity_grids(model, likelihood, best[None], jnp.zeros(5), jnp.ones((GRID,) * 3, bool))

@@ -31,8 +31,8 @@ from benchmarks.harness.study import Summary, TableOptions
 from benchmarks.harness.tables import Table, between, verdict
 from benchmarks.measures.rebuilt import GRID, VIEWS, GateConfig, Rebuilt, rebuild_all, render_pixels
 from probnerf.objects.tabletop import TEST_SEEDS
-from probnerf.prior.checkpoint import load_prior
-from probnerf.prior.networks import ProbNeRF
+from probnerf.prior.checkpoint import Prior, load_prior, load_recognition, recognition_path
+from probnerf.prior.networks import ProbNeRF, Recognition
 from probnerf.settings import AdamConfig
 
 PSNR_DB, IOU, RECALLED = 25.0, 0.8, 0.9  # the gate
@@ -80,7 +80,8 @@ class Options(TableOptions):
 
 def main(options: Options) -> Summary:
     """Measure, and sum up."""
-    model = load_prior(options.prior).model
+    prior = load_prior(options.prior)
+    model = prior.model
     config = GateConfig(fit=AdamConfig(steps=options.steps), rays=options.rays)
     n = min(options.n, 10) if options.quick else options.n
     rebuilt: list[Rebuilt] = []
@@ -93,19 +94,22 @@ def main(options: Options) -> Summary:
     tables = [_gate_table(found, rows)] if rebuilt else []
     rows.append(Row("prior", "map", f"{VIEWS} views", "passed", float(found["passed"]), "", len(rebuilt)))
     if options.household:
-        more, table = _household(model, min(options.household, 5) if options.quick else options.household)
+        count = min(options.household, 5) if options.quick else options.household
+        beside = None if options.prior is None else recognition_path(options.prior)
+        recognition = load_recognition(beside, prior) if beside is not None and beside.is_file() else None
+        more, table = _household(prior, recognition, count)
         rows += more
         tables.append(table)
     return Summary(rows, tables, lambda: _draw(model, rebuilt, config))
 
 
-def _household(model: ProbNeRF, count: int) -> tuple[list[Row], Table]:
+def _household(prior: Prior, recognition: Recognition | None, count: int) -> tuple[list[Row], Table]:
     """Figures of household things: of each source, and of all."""
     from benchmarks.measures.refitted import held_out_things, refit  # it needs the extra `meshes`
 
     fitted = []
     for source, thing, seed in held_out_things(count, FOLDERS):
-        one = refit(model, source, thing, seed)
+        one = refit(prior.model, source, thing, seed, recognition)
         fitted.append(one)
         say(f"{len(fitted):4d} {source:16s} {one.name:28s} iou {one.iou:.3f}, thin parts {one.thin:.2f}")
     rows, lines = [], []

@@ -309,7 +309,8 @@ class Training:
     """Sizes of the model: small (vessels and cartons), household (all kinds of things), the paper's, or tiny for a
     trial."""
     start: Path | None = None
-    """Initial weights, of the same preset; give --frozen-steps with it. Random by default."""
+    """Initial weights, of the same preset. Give --frozen-steps with it, unless NAME.recognition.safetensors lies beside
+    it. Random by default."""
     objects: int = 40_000
     """Vessels and cartons: the first seeds of the tabletop family."""
     household: int = 0

@@ -1,6 +1,7 @@
 """Training a prior: the views, the run (resumed after a stop), its curves, and the weights at the end."""
 
 import json
+import os
 import subprocess
 import zlib
 from collections.abc import Callable, Iterator
@@ -27,7 +28,7 @@ from node.commands.options import Training
 from node.figures.object_figure import draw_training
 from probnerf.likelihood.settings import Likelihood
 from probnerf.objects.tabletop import TRAIN_SEEDS
-from probnerf.prior.checkpoint import load_prior, save_prior, save_recognition
+from probnerf.prior.checkpoint import load_prior, load_recognition, recognition_path, save_prior, save_recognition
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering import foam
 from probnerf.training import elbo as training
@@ -55,6 +56,9 @@ def train(options: Training, out: Console, err: Console) -> bool:
     if options.pictures is not None and options.pictures < 1:
         raise ValueError(f"--pictures is {options.pictures}; give 1 or more")
     begun = None if options.start is None else load_prior(options.start, preset=options.preset)
+    recognition = None
+    if options.start is not None and begun is not None and recognition_path(options.start).is_file():
+        recognition = load_recognition(recognition_path(options.start), begun)
     key = np.array([0, config.seed], np.uint32)  # a raw key
     model = ProbNeRF(preset, key) if begun is None else begun.model  # type: ignore[arg-type]
     weights = folder / "prior.safetensors"
@@ -68,7 +72,7 @@ def train(options: Training, out: Console, err: Console) -> bool:
         ):
             solids, views, story = _material(options, preset.image_size, progress)
             steps = progress.add_task("steps", total=config.steps)
-            for state, metrics in training.train(model, solids, views, likelihood, config, folder):  # noqa: B007
+            for state, metrics in training.train(model, solids, views, likelihood, config, folder, recognition):  # noqa: B007
                 text = "steps  " + "  ".join(f"{k} {v:.4g}" for k, v in metrics.items() if k != "step")
                 progress.update(steps, completed=int(metrics["step"]), description=text)
     except KeyboardInterrupt:
@@ -86,7 +90,7 @@ def train(options: Training, out: Console, err: Console) -> bool:
     }
     save_prior(weights, state.model, story, half=preset.name == "household")
     if options.data is None:
-        save_recognition(folder / "recognition.safetensors", state.recognition, load_prior(weights).hash)
+        save_recognition(recognition_path(weights), state.recognition, load_prior(weights).hash)
     out.print(f"{weights}; judge it with `farside bench prior --prior {weights}`", highlight=False, soft_wrap=True)
     return True
 
@@ -104,7 +108,8 @@ def drawn_curves(folder: Path, out: Console) -> Iterator[None]:
 
 
 def learnt_objects(run: Path) -> dict[str, Any]:
-    """Which objects the run of this folder learns: `objects`, `household`, `variants` and `meshes` of its options.
+    """Which objects the run of this folder learns: `objects`, `household`, `variants` and `meshes` of its options, the
+    last as paths from the folder.
 
     Raises FileNotFoundError if the run does not tell.
     """
@@ -127,7 +132,7 @@ def _material(
         views = read_views(options.data, size, options.pictures, advance(reading))
         return [], views, {"family": "srn", "data": options.data.name, "objects": len(views.seeds)}
     learnt = {name: getattr(options, name) for name in ("objects", "household", "variants")}
-    learnt["meshes"] = [str(meshes.resolve()) for meshes in options.meshes]
+    learnt["meshes"] = [os.path.relpath(meshes, options.out) for meshes in options.meshes]
     write_whole(options.out / LEARNT, json.dumps(learnt, indent=1).encode())
     sampling = progress.add_task("objects", total=options.objects)
     seeds = np.asarray(TRAIN_SEEDS[: options.objects])

@@ -4,7 +4,6 @@ import json
 import os
 import zlib
 from dataclasses import asdict
-from pathlib import Path
 
 import jax
 from rich.console import Console
@@ -20,7 +19,13 @@ from node.commands.train import (
     revision,
 )
 from probnerf.objects.tabletop import TRAIN_SEEDS
-from probnerf.prior.checkpoint import load_prior, load_recognition, network_path, save_posterior_network
+from probnerf.prior.checkpoint import (
+    load_prior,
+    load_recognition,
+    network_path,
+    recognition_path,
+    save_posterior_network,
+)
 from probnerf.prior.posterior_flow import NetworkSizes, PosteriorNetwork
 from probnerf.training import posterior_flow as training
 
@@ -38,14 +43,14 @@ def train_network(options: NetworkTraining, out: Console, err: Console) -> bool:
 
     prior_file, folder = options.run / "prior.safetensors", options.run / "network"
     prior = load_prior(prior_file)
-    recognition = load_recognition(options.run / "recognition.safetensors", prior)
+    recognition = load_recognition(recognition_path(prior_file), prior)
     learnt = learnt_objects(options.run)
     families = Families(
         tabletop=TRAIN_SEEDS[: learnt["objects"]],
         tabletop_share=TABLETOP_SHARE,
         household=TRAIN_SEEDS[: learnt["household"]],
         household_variants=household_variants(learnt["variants"]),
-        folders=tuple(Path(folder) for folder in learnt["meshes"]),
+        folders=tuple(options.run / folder for folder in learnt["meshes"]),
         folder_variants=learnt["variants"],
     )
     told = zlib.crc32(json.dumps([learnt, options.image_size], sort_keys=True).encode())

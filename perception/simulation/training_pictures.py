@@ -26,7 +26,7 @@ from probnerf.prior.networks import Recognition
 from probnerf.training.learnt_objects import Families, LearntObject, draw_objects
 from probnerf.training.picture_set import PictureSet
 
-OBJECTS, VIEWS = 64, 6  # of a part: objects, and views of each
+OBJECTS, VIEWS = 64, 2  # of a part; many views of few objects teach a network those objects, not how to tell shapes
 LOOKS = ViewDraws(focal=(180.0, 420.0))  # pictures are shrunk anyway; coarser ones are drawn faster
 _ONE_THREAD = {  # of each process; and none of them takes an accelerator's memory
     "JAX_PLATFORMS": "cpu",

@@ -128,6 +128,11 @@ def load_posterior_network(path: Path, prior: Prior) -> TrainedNetwork:
     return TrainedNetwork(_filled(network, arrays, path, "this architecture"), story, _hash(path))
 
 
+def recognition_path(prior: Path) -> Path:
+    """Where the recognition of the prior in this file is kept: NAME.recognition.safetensors beside it."""
+    return prior.with_suffix(".recognition.safetensors")
+
+
 def save_recognition(path: Path, recognition: Recognition, prior: str) -> None:
     """Write atomically, in half precision. `prior` is the hash of the prior that it was trained with.
 

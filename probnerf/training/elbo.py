@@ -239,10 +239,11 @@ def optimiser_of(config: TrainConfig) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(200.0), optax.multi_transform(rates, labels))
 
 
-def initial_state(model: ProbNeRF, config: TrainConfig) -> TrainState:
-    """The state of a new run."""
+def initial_state(model: ProbNeRF, config: TrainConfig, recognition: Recognition | None = None) -> TrainState:
+    """The state of a new run. Without a recognition it begins with a random one."""
     key = jax.random.fold_in(jax.random.key(config.seed), 1)
-    recognition = Recognition(DESCRIPTION, model.latent, model.preset.hyper_hidden, key)
+    if recognition is None:
+        recognition = Recognition(DESCRIPTION, model.latent, model.preset.hyper_hidden, key)
     optimiser = optimiser_of(config).init((model, recognition))
     return TrainState(model, recognition, optimiser, jnp.zeros((), jnp.int32))
 
@@ -270,6 +271,7 @@ def train(
     likelihood: Likelihood,
     config: TrainConfig,
     folder: Path,
+    recognition: Recognition | None = None,
 ) -> Iterator[tuple[TrainState, dict[str, float]]]:
     """Run or resume in `folder`; yields (state, metrics) every `log_every` steps and appends them to history.jsonl.
 
@@ -283,7 +285,7 @@ def train(
         raise ValueError(f"--views is {config.views} but objects have {views.rgb.shape[1]} pictures; give no more")
     run = RunFolder(folder, config)
     # a copy, because a step donates its input buffers
-    state = run.resume(initial_state(jax.tree.map(jnp.copy, model), config))
+    state = run.resume(initial_state(jax.tree.map(jnp.copy, model), config, jax.tree.map(jnp.copy, recognition)))
     strata = strata_of(views)
     start = int(state.step)
 

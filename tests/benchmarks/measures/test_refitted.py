@@ -1,5 +1,6 @@
 """What a prior is asked to hold: walls of a mesh on a grid, and which of its parts are thin."""
 
+import jax
 import numpy as np
 import pytest
 import trimesh
@@ -7,9 +8,11 @@ import trimesh
 pytest.importorskip("igl")
 pytest.importorskip("manifold3d")
 
-from benchmarks.measures.refitted import GRID, held_out_things, thin_parts, walls
+from benchmarks.measures.refitted import GRID, held_out_things, refit, thin_parts, walls
 from probnerf.objects.mesh import canonical
+from probnerf.prior.networks import PRESETS, ProbNeRF, Recognition
 from probnerf.rendering.occupancy import voxel_centres
+from probnerf.training.shape_set import DESCRIPTION
 
 
 def test_walls_are_voxels_that_the_solid_meets() -> None:
@@ -38,3 +41,15 @@ def test_held_out_things_are_the_generators_validation_seeds() -> None:
     things = list(held_out_things(2, {}))
     assert [source for source, *_ in things] == ["generator", "generator"]
     assert all(name.endswith(("_1000000", "_1000001")) for _, thing, _ in things for name in (thing.name,))
+
+
+@pytest.mark.slow
+def test_a_fit_begins_where_recognition_tells() -> None:
+    """An untrained recognition tells another start, so another fit; both are judged by the same true solid."""
+    box = trimesh.creation.box((0.2, 0.1, 0.08))
+    thing = canonical(box.vertices, box.faces)
+    model = jax.jit(lambda key: ProbNeRF(PRESETS["tiny"], key))(jax.random.key(0))
+    told = Recognition(DESCRIPTION, model.latent, 8, jax.random.key(1))
+    plain, begun = (refit(model, "", thing, 0, recognition) for recognition in (None, told))
+    assert np.array_equal(plain.true_solid, begun.true_solid) and 0.0 <= plain.iou <= 1.0
+    assert not np.array_equal(plain.solid, begun.solid)

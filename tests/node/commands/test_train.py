@@ -37,9 +37,17 @@ class Trainer:
         self.asked: dict[str, Any] = {}
 
     def __call__(
-        self, model: Any, solids: Any, views: ViewSet, likelihood: Any, config: TrainConfig, folder: Path
+        self,
+        model: Any,
+        solids: Any,
+        views: ViewSet,
+        likelihood: Any,
+        config: TrainConfig,
+        folder: Path,
+        recognition: Any = None,
     ) -> Iterator:
         self.asked = {"model": model, "solids": solids, "views": views, "config": config, "likelihood": likelihood}
+        self.asked["recognition"] = recognition
         folder.mkdir(parents=True, exist_ok=True)
         for step in (config.steps // 2, config.steps):
             metrics = {"step": step, "loss": 3.0 / step, "fit": -1.0, "kl": 2.0}
@@ -75,7 +83,7 @@ def test_the_recipe_is_handed_over_and_the_weights_exported(
     prior = load_prior(folder / "prior.safetensors", preset="tiny")
     assert prior.metadata["seeds"] == [0, 3] and prior.metadata["steps"] == 10
     assert prior.metadata["recipe"]["seed"] == 4 and prior.metadata["revision"]
-    assert load_recognition(folder / "recognition.safetensors", prior).hidden.first.in_features == 4
+    assert load_recognition(folder / "prior.recognition.safetensors", prior).hidden.first.in_features == 4
     learnt = json.loads((folder / "learnt.json").read_text())
     assert learnt == {"objects": 3, "household": 0, "variants": 8, "meshes": []}
     assert (folder / "curves.png").stat().st_size > 1000

@@ -27,7 +27,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run, tiny = tmp_path_factory.mktemp("run"), PRESETS["tiny"]
     save_prior(run / "prior.safetensors", jax.jit(lambda key: ProbNeRF(tiny, key))(jax.random.key(0)), {})
     recognition = Recognition(DESCRIPTION, tiny.latent, tiny.hyper_hidden, jax.random.key(1))
-    save_recognition(run / "recognition.safetensors", recognition, load_prior(run / "prior.safetensors").hash)
+    save_recognition(run / "prior.recognition.safetensors", recognition, load_prior(run / "prior.safetensors").hash)
     learnt = {"objects": 4, "household": 3, "variants": 8, "meshes": []}
     (run / "learnt.json").write_text(json.dumps(learnt))
     return run
@@ -56,7 +56,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 def test_the_prior_is_read_with_its_network_afterwards(finished: Path, asked: dict, capsys) -> None:
     arguments = ["--run", str(finished), "--pictures", "400", "--image-size", "16", "--steps", "7"]
     assert main(["train-network", *arguments]) == 0
-    assert asked["config"] == PosteriorTrainConfig(steps=7) and asked["pictures"] == ["0", "1"]
+    assert asked["config"] == PosteriorTrainConfig(steps=7) and asked["pictures"] == ["0", "1", "2"]
     families = asked["families"]
     assert len(families.tabletop) == 4 and len(families.household) == 3 and families.household_variants == 2
     network = load_prior(finished / "prior.safetensors").network
@@ -67,7 +67,7 @@ def test_the_prior_is_read_with_its_network_afterwards(finished: Path, asked: di
 def test_a_folder_without_a_finished_run_is_refused(finished: Path, asked: dict, tmp_path: Path, capsys) -> None:
     assert main(["train-network", "--run", str(tmp_path)]) == 1
     assert "no such prior" in capsys.readouterr().err
-    for name in ("prior.safetensors", "recognition.safetensors"):
+    for name in ("prior.safetensors", "prior.recognition.safetensors"):
         (tmp_path / name).write_bytes((finished / name).read_bytes())
     assert main(["train-network", "--run", str(tmp_path)]) == 1
     assert "learnt.json: no such file" in capsys.readouterr().err
