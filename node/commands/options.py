@@ -339,8 +339,10 @@ class NetworkTraining:
     run: Path = Path("runs/tabletop")
     """Folder of a finished run of `farside train`. It gets the pictures, network/ (checkpoint, history, curves.png)
     and, in the end, prior.network.safetensors."""
+    plain: int = 100_000
+    """Plain pictures: one object alone, cheap to draw. They teach how whole shapes look."""
     pictures: int = 20_000
-    """About how many pictures; those that perception refuses count. They are kept, so that a later run can add some."""
+    """Pictures of scenes, as perception sees them; those that it refuses count. All are kept for later runs."""
     image_size: int = 32
     """Pixels a side of a picture."""
     processes: int | None = None

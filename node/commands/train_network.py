@@ -4,6 +4,7 @@ import json
 import os
 import zlib
 from dataclasses import asdict
+from pathlib import Path
 
 import jax
 from rich.console import Console
@@ -38,7 +39,7 @@ def train_network(options: NetworkTraining, out: Console, err: Console) -> bool:
     """
     require_mesh_libraries()
     # only here: it needs them
-    from perception.simulation.training_pictures import OBJECTS, VIEWS, PicturePart, draw_parts, picture_set
+    from perception.simulation.training_pictures import OBJECTS, PLAIN, VIEWS, PicturePart, draw_parts, picture_set
     from probnerf.training.learnt_objects import Families
 
     prior_file, folder = options.run / "prior.safetensors", options.run / "network"
@@ -55,7 +56,6 @@ def train_network(options: NetworkTraining, out: Console, err: Console) -> bool:
     )
     told = zlib.crc32(json.dumps([learnt, options.image_size], sort_keys=True).encode())
     size = NetworkSizes(latent=prior.model.latent, image_size=options.image_size)
-    count = max(1, round(options.pictures / (OBJECTS * VIEWS)))
     processes = options.processes or os.cpu_count() or 1
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     state = None
@@ -64,13 +64,13 @@ def train_network(options: NetworkTraining, out: Console, err: Console) -> bool:
             Progress(*columns, TimeRemainingColumn(), console=err, disable=not err.is_terminal) as progress,
             drawn_curves(folder, out),
         ):
-            drawing = progress.add_task("pictures", total=count * OBJECTS * VIEWS)
-            files = []
-            for path in draw_parts(
-                options.run / f"pictures-{told:08x}", range(count), families, size.image_size, processes
-            ):
-                files.append(path)
-                progress.update(drawing, completed=len(files) * OBJECTS * VIEWS)
+            kept, files = options.run / f"pictures-{told:08x}", list[Path]()
+            for plain, wanted, each in ((True, options.plain, PLAIN), (False, options.pictures, OBJECTS * VIEWS)):
+                count = -(-wanted // each)
+                drawing = progress.add_task("plain pictures" if plain else "pictures", total=count)
+                for path in draw_parts(kept, range(count), families, size.image_size, processes, plain=plain):
+                    files.append(path)
+                    progress.advance(drawing)
             pictures = picture_set([PicturePart.load(path) for path in sorted(files)], recognition)
             network = PosteriorNetwork(size, jax.random.key(options.recipe.seed))
             steps = progress.add_task("steps", total=options.recipe.steps)

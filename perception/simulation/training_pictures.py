@@ -16,17 +16,19 @@ from pathlib import Path
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from foundation.whole_file import whole_file
 from perception.simulation.examples import Example, ExampleDraws, draw_example
 from perception.simulation.mesh_scene import MeshShape
+from perception.simulation.plain_pictures import PlainDraws, TrainingPicture, draw_plain
 from perception.simulation.view_draws import ViewDraws
 from probnerf.prior.networks import Recognition
 from probnerf.training.learnt_objects import Families, LearntObject, draw_objects
 from probnerf.training.picture_set import PictureSet
 
 OBJECTS, VIEWS = 64, 2  # of a part; many views of few objects teach a network those objects, not how to tell shapes
+PLAIN_OBJECTS, PLAIN_VIEWS = 256, 6  # of a part of plain pictures
+PLAIN = PLAIN_OBJECTS * PLAIN_VIEWS
 LOOKS = ViewDraws(focal=(180.0, 420.0))  # pictures are shrunk anyway; coarser ones are drawn faster
 _ONE_THREAD = {  # of each process; and none of them takes an accelerator's memory
     "JAX_PLATFORMS": "cpu",
@@ -77,16 +79,30 @@ def draw_part(
     rng = np.random.default_rng([number, 71])
     things = draw_objects(rng, objects, families)
     shapes = [MeshShape(t.vertices, t.faces, t.half_extent, t.colours, lit=True) for t in things]
-    examples, rows, reasons = [], [], Counter[str]()
+    pictures, rows, reasons = [], [], Counter[str]()
     for row, shape in enumerate(shapes):
         for _ in range(views):
             found = draw_example(rng, shape, shapes, size, draws, looks)
             if isinstance(found, Example):
-                examples.append(found)
+                pictures.append(_training_picture(found))
                 rows.append(row)
             else:
                 reasons[found] += 1
-    return _part(examples, np.array(rows, np.int32), things), reasons
+    return _part(pictures, np.array(rows, np.int32), things), reasons
+
+
+def draw_plain_part(
+    number: int, families: Families, objects: int, views: int, size: int, draws: PlainDraws | None = None
+) -> PicturePart:
+    """One part of plain pictures (`plain_pictures`)."""
+    rng = np.random.default_rng([number, 73])
+    things = draw_objects(rng, objects, families)
+    pictures, rows = [], []
+    for row, thing in enumerate(things):
+        drawn = draw_plain(rng, thing, views, size, draws)
+        pictures += drawn
+        rows += [row] * len(drawn)
+    return _part(pictures, np.array(rows, np.int32), things)
 
 
 def draw_parts(
@@ -95,18 +111,22 @@ def draw_parts(
     families: Families,
     size: int,
     processes: int,
-    objects: int = OBJECTS,
-    views: int = VIEWS,
+    *,
+    plain: bool = False,
+    objects: int | None = None,
+    views: int | None = None,
 ) -> Iterator[Path]:
     """The files of these parts, in any order: those that are there already, and the others when they are drawn."""
+    objects = objects or (PLAIN_OBJECTS if plain else OBJECTS)
+    views = views or (PLAIN_VIEWS if plain else VIEWS)
     folder.mkdir(parents=True, exist_ok=True)
-    paths = {number: folder / f"part_{number:05d}.npz" for number in numbers}
+    paths = {number: folder / f"{'plain' if plain else 'part'}_{number:05d}.npz" for number in numbers}
     missing = [number for number, path in paths.items() if not path.exists()]
     yield from (path for number, path in paths.items() if number not in missing)
     if not missing:
         return
     with _environment(_ONE_THREAD), ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
-        jobs = {pool.submit(_draw_kept, paths[n], n, families, objects, views, size): n for n in missing}
+        jobs = {pool.submit(_draw_kept, paths[n], n, families, objects, views, size, plain): n for n in missing}
         try:
             for job in as_completed(jobs):
                 job.result()
@@ -135,8 +155,11 @@ def picture_set(parts: Sequence[PicturePart], recognition: Recognition) -> Pictu
     )
 
 
-def _draw_kept(path: Path, number: int, families: Families, objects: int, views: int, size: int) -> None:
-    draw_part(number, families, objects, views, size, looks=LOOKS)[0].save(path)
+def _draw_kept(path: Path, number: int, families: Families, objects: int, views: int, size: int, plain: bool) -> None:
+    if plain:
+        draw_plain_part(number, families, objects, views, size).save(path)
+    else:
+        draw_part(number, families, objects, views, size, looks=LOOKS)[0].save(path)
 
 
 @contextmanager
@@ -151,20 +174,33 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
             os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
-def _part(examples: list[Example], rows: np.ndarray, things: list[LearntObject]) -> PicturePart:
-    def stacked(name: str, kind: type) -> np.ndarray:
-        return np.stack([np.asarray(getattr(e.picture, name)) for e in examples]).astype(kind)
+def _training_picture(example: Example) -> TrainingPicture:
+    seen, pose = example.picture, example.pose
+    return TrainingPicture(
+        rgb=np.asarray(seen.rgb),
+        distance=np.asarray(seen.distance),
+        unknown=np.asarray(seen.unknown),
+        T_view_camera=np.asarray(seen.T_view_camera),
+        tan_half_fov=float(seen.tan_half_fov),
+        pose_sigma=example.pose_sigma,
+        yaw=float(np.arctan2(pose[1], pose[0])),
+        pose=pose[[2, 3, 4, 6]],
+    )
 
-    pose: Float[np.ndarray, "n 7"] = np.stack([e.pose for e in examples])
+
+def _part(pictures: list[TrainingPicture], rows: np.ndarray, things: list[LearntObject]) -> PicturePart:
+    def stacked(name: str, kind: type) -> np.ndarray:
+        return np.stack([np.asarray(getattr(picture, name)) for picture in pictures]).astype(kind)
+
     return PicturePart(
         rgb=np.round(255.0 * stacked("rgb", np.float32)).astype(np.uint8),
         distance=stacked("distance", np.float16),
         unknown=stacked("unknown", np.uint8),
         T_view_camera=stacked("T_view_camera", np.float32),
         tan_half_fov=stacked("tan_half_fov", np.float32),
-        pose_sigma=np.stack([e.pose_sigma for e in examples]).astype(np.float32),
-        yaw=np.arctan2(pose[:, 1], pose[:, 0]).astype(np.float32),
-        pose=pose[:, [2, 3, 4, 6]].astype(np.float32),
+        pose_sigma=stacked("pose_sigma", np.float32),
+        yaw=stacked("yaw", np.float32),
+        pose=stacked("pose", np.float32),
         row=rows,
         description=np.stack([t.description for t in things]).astype(np.float16),
         kind=np.array([t.kind for t in things], np.uint8),

@@ -38,9 +38,11 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Drawing and training by stand-ins: what they are asked."""
     found: dict[str, Any] = {}
 
-    def draw_parts(folder: Path, numbers: range, families: Any, size: int, processes: int) -> Iterator[Path]:
+    def draw_parts(
+        folder: Path, numbers: range, families: Any, size: int, processes: int, plain: bool
+    ) -> Iterator[Path]:
         found.update(numbers=numbers, families=families, size=size)
-        yield from (folder / f"{n}" for n in numbers)
+        yield from (folder / f"{'plain' if plain else 'part'} {n}" for n in numbers)
 
     def train(network: Any, pictures: Any, config: PosteriorTrainConfig, folder: Path, prior: Any) -> Iterator:
         found.update(config=config, pictures=pictures)
@@ -54,9 +56,14 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 def test_the_prior_is_read_with_its_network_afterwards(finished: Path, asked: dict, capsys) -> None:
-    arguments = ["--run", str(finished), "--pictures", "400", "--image-size", "16", "--steps", "7"]
+    arguments = ["--run", str(finished), "--pictures", "200", "--plain", "1600", "--image-size", "16", "--steps", "7"]
     assert main(["train-network", *arguments]) == 0
-    assert asked["config"] == PosteriorTrainConfig(steps=7) and asked["pictures"] == ["0", "1", "2"]
+    assert asked["config"] == PosteriorTrainConfig(steps=7) and asked["pictures"] == [
+        "part 0",
+        "part 1",
+        "plain 0",
+        "plain 1",
+    ]
     families = asked["families"]
     assert len(families.tabletop) == 4 and len(families.household) == 3 and families.household_variants == 2
     network = load_prior(finished / "prior.safetensors").network
