@@ -21,14 +21,13 @@ from node.commands.options import (
     Calibrate,
     Capture,
     LiveConfig,
-    NetworkTraining,
     Query,
     Record,
     ReplayConfig,
-    Training,
     View,
     options_of,
 )
+from node.commands.training_options import NetworkTraining, Training
 from probnerf.environment import prepare
 
 Config = TypeVar("Config", ReplayConfig, LiveConfig)

@@ -22,6 +22,8 @@ BODY_EXTENT = 1.4  # the larger of an object's longest horizontal side and its h
 # Pixel statuses of an Observation (object / free / unknown).
 UNKNOWN, OBJECT, FREE = 0, 1, 2
 
+KINDS = ("vessel", "box", "other")  # of things; vessel: any container from bowl to bottle, with or without a lid
+
 # Entries of a position vector that tell the pose: a, b (yaw = atan2(b, a)), x, y, log-scale, range offset, z.
 POSE_SIZE = 7
 

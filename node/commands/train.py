@@ -24,7 +24,7 @@ from rich.progress import (
 )
 
 from foundation.whole_file import write_whole
-from node.commands.options import Training
+from node.commands.training_options import Training
 from node.figures.object_figure import draw_training
 from probnerf.likelihood.settings import Likelihood
 from probnerf.objects.tabletop import TRAIN_SEEDS

@@ -6,11 +6,10 @@ import zlib
 from dataclasses import asdict
 from pathlib import Path
 
-import jax
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from node.commands.options import NetworkTraining
 from node.commands.train import (
     TABLETOP_SHARE,
     drawn_curves,
@@ -19,6 +18,7 @@ from node.commands.train import (
     require_mesh_libraries,
     revision,
 )
+from node.commands.training_options import NetworkTraining
 from probnerf.objects.tabletop import TRAIN_SEEDS
 from probnerf.prior.checkpoint import (
     load_prior,
@@ -72,7 +72,8 @@ def train_network(options: NetworkTraining, out: Console, err: Console) -> bool:
                     files.append(path)
                     progress.advance(drawing)
             pictures = picture_set([PicturePart.load(path) for path in sorted(files)], recognition)
-            network = PosteriorNetwork(size, jax.random.key(options.recipe.seed))
+            key = np.array([0, options.recipe.seed], np.uint32)  # a raw key
+            network = PosteriorNetwork(size, key)  # type: ignore[arg-type]
             steps = progress.add_task("steps", total=options.recipe.steps)
             for state, metrics in training.train(  # noqa: B007
                 network, pictures, options.recipe, folder, prior.model.flow

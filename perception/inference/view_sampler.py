@@ -17,7 +17,6 @@ from perception.observation.encoder_crop import crop
 from probnerf.inference import asks_encoder, crossings_of, encoder_guess, infer, likelihood_of, modes_of, sampler_of
 from probnerf.likelihood.settings import Likelihood
 from probnerf.network_start import defensive, network_guess, network_used, picture_density, weigh_draws
-from probnerf.objects.shape_kinds import KINDS
 from probnerf.prior.checkpoint import Prior
 from probnerf.prior.networks import ProbNeRF
 from probnerf.prior.posterior_flow import PictureDensity
@@ -25,7 +24,7 @@ from probnerf.prior.posterior_network import EncoderPicture
 from probnerf.sampling.hmc import Reference, StageInfo
 from probnerf.sampling.importance import WeighedDraws
 from probnerf.settings import InferConfig, TemperedSMCConfig
-from probnerf.types import Posterior, StopReason
+from probnerf.types import KINDS, Posterior, StopReason
 
 # Two batches of eigenvalues may wait for each other for ever: each holds a thread of XLA's pool, one per core, until
 _ONE_AT_A_TIME = RLock()  # another thread of that pool has done its parts (jaxlib's ParallelBatchMap)

@@ -8,7 +8,6 @@ them: what is beside, in front, missing and mistaken.
 
 from dataclasses import dataclass, field
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
@@ -18,7 +17,7 @@ from perception.simulation.ray_caster import RayCaster
 from probnerf.geometry import look_at, pinhole_rays
 from probnerf.prior.encoder_input import ENCODER_RADIUS
 from probnerf.training.learnt_objects import LearntObject
-from probnerf.types import Pose
+from probnerf.types import Pose, on_device
 
 
 @dataclass(frozen=True)
@@ -64,14 +63,14 @@ def _view(
 ) -> TrainingPicture | None:
     yaw, sigma, drawn = _pose(rng, thing.half_extent, draws)
     x, y, log_scale, z = drawn * sigma[[0, 1, 2, 4]]
-    pose = Pose(*(jnp.asarray(a) for a in (yaw, x, y, log_scale, z)))
+    pose = Pose(*(on_device(a) for a in (yaw, x, y, log_scale, z)))
     elevation = np.deg2rad(rng.uniform(*draws.elevation))
     away = max(rng.uniform(*draws.distance_m) / thing.half_extent * np.exp(log_scale), draws.nearest)
     T = look_at(away * np.array([np.cos(elevation), 0.0, np.sin(elevation)]), np.zeros(3))
     tan_half = ENCODER_RADIUS / away
     origin, direction = pinhole_rays(T, 0.5 * size / tan_half, size)
-    start = np.asarray(pose.to_object(jnp.asarray(origin[0])))
-    towards = np.asarray(pose.to_object_direction(jnp.asarray(direction)))
+    start = np.asarray(pose.to_object(on_device(origin[0])))
+    towards = np.asarray(pose.to_object_direction(on_device(direction)))
     met = caster.cast(start, towards)
     hit = np.isfinite(met.distance)
     if not hit.any():

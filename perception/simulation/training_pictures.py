@@ -13,8 +13,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from foundation.whole_file import whole_file
@@ -24,7 +22,7 @@ from perception.simulation.plain_pictures import PlainDraws, TrainingPicture, dr
 from perception.simulation.view_draws import ViewDraws
 from probnerf.prior.networks import Recognition
 from probnerf.training.learnt_objects import Families, LearntObject, draw_objects
-from probnerf.training.picture_set import PictureSet
+from probnerf.training.picture_set import PictureSet, recognised
 
 OBJECTS, VIEWS = 64, 2  # of a part; many views of few objects teach a network those objects, not how to tell shapes
 PLAIN_OBJECTS, PLAIN_VIEWS = 256, 6  # of a part of plain pictures
@@ -138,18 +136,13 @@ def draw_parts(
 
 def picture_set(parts: Sequence[PicturePart], recognition: Recognition) -> PictureSet:
     """The parts' pictures with their objects' latents, as recognition tells them."""
-    recognised = eqx.filter_jit(eqx.filter_vmap(recognition))
-    means, sds = [], []
-    for part in parts:
-        mean, precision = recognised(jnp.asarray(part.description, jnp.float32))
-        means.append(np.asarray(mean)[part.row])
-        sds.append(1.0 / np.sqrt(np.asarray(precision)[part.row]))
+    latents = recognised(recognition, [part.description for part in parts])
     kept = {f.name for f in fields(PictureSet)} & {f.name for f in fields(PicturePart)} - {"kind"}
     owner = [(part.family.astype(np.int64) << 40) + part.seed for part in parts]
     return PictureSet(
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in kept},
-        mean=np.concatenate(means),
-        sd=np.concatenate(sds),
+        mean=np.concatenate([mean[part.row] for (mean, _), part in zip(latents, parts, strict=True)]),
+        sd=np.concatenate([sd[part.row] for (_, sd), part in zip(latents, parts, strict=True)]),
         object_id=np.concatenate([each[part.row] for each, part in zip(owner, parts, strict=True)]),
         kind=np.concatenate([part.kind[part.row] for part in parts]),
     )

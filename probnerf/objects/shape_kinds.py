@@ -2,8 +2,6 @@
 
 import re
 
-KINDS = ("vessel", "box", "other")  # vessel: any container from bowl to bottle, with or without a lid
-
 _VESSELS = frozenset(
     "mug cup bowl bottle jar vase pot goblet beaker flask glass wineglass can canned jug pitcher tankard kettle teapot"
     " chalice bucket basket tin pan amphora urn carafe barrel pottery bin tub ramekin tumbler".split()

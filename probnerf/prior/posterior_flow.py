@@ -20,11 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from probnerf.objects.shape_kinds import KINDS
 from probnerf.prior.conditional_densities import ConditionalFlow, TripleMixture, YawMixture, zeroed
 from probnerf.prior.picture_summary import PictureSummary, affine, harmonics, turned, turned_moments
 from probnerf.prior.posterior_network import EncoderPicture
-from probnerf.types import POSE_SIZE
+from probnerf.types import KINDS, POSE_SIZE
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
 

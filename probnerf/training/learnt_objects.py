@@ -14,12 +14,12 @@ from skimage.measure import marching_cubes
 
 from probnerf.objects.household import draw_mesh
 from probnerf.objects.mesh import MeshObject, read_folder
-from probnerf.objects.shape_kinds import KINDS, kind_of_name
+from probnerf.objects.shape_kinds import kind_of_name
 from probnerf.objects.tabletop import TabletopObject, colour, sample_object, signed_distance
 from probnerf.training.mesh_shapes import NATURAL, PAINTS, held_out, paint_of, placed, sample_mesh, variant
 from probnerf.training.shape_set import ShapeSet, batch_of
 from probnerf.training.tabletop_shapes import tabletop_shapes
-from probnerf.types import BASE_Z
+from probnerf.types import BASE_Z, KINDS
 
 Colours = Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 TABLETOP, HOUSEHOLD, FOLDER = range(3)  # families

@@ -11,7 +11,7 @@ import trimesh
 from probnerf.objects.household import draw_mesh
 from probnerf.objects.mesh import MeshObject, canonical, read_folder, rests
 from probnerf.objects.paint import Paint, draw_paint
-from probnerf.objects.shape_kinds import KINDS, kind_of_name
+from probnerf.objects.shape_kinds import kind_of_name
 from probnerf.objects.tabletop_sampler import SLACK_LOG_SCALE, SLACK_SHIFT
 from probnerf.training.shape_set import (
     ANYWHERE,
@@ -28,7 +28,7 @@ from probnerf.training.shape_set import (
     joined,
     nearest,
 )
-from probnerf.types import BASE_Z
+from probnerf.types import BASE_Z, KINDS
 
 PAINTS = 4  # of each mesh
 STRETCH = 0.12  # standard deviation of each axis's log scale, of all variants but the first

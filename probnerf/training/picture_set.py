@@ -1,5 +1,6 @@
 """Training examples of the posterior network: pictures with what stands in them, and what training does to them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from foundation.whole_file import whole_file
+from probnerf.prior.networks import Recognition
 from probnerf.prior.posterior_network import EncoderPicture
 from probnerf.training.settings import PosteriorTrainConfig
 from probnerf.types import BASE_Z, on_device
@@ -58,6 +60,13 @@ class PictureSet:
                 raise FileNotFoundError(f"{path}: no such array of a picture set; draw the pictures again")
             arrays[field.name] = np.load(path, mmap_mode="r", allow_pickle=False)
         return cls(**arrays)
+
+
+def recognised(recognition: Recognition, descriptions: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Mean and standard deviation of z ([n, K] each) of the objects of each array of descriptions [n, d]."""
+    every = eqx.filter_jit(eqx.filter_vmap(recognition))
+    told = (every(on_device(each)) for each in descriptions)
+    return [(np.asarray(mean), 1.0 / np.sqrt(np.asarray(precision))) for mean, precision in told]
 
 
 class Examples(eqx.Module):

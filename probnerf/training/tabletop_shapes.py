@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from probnerf.objects.shape_kinds import KINDS
 from probnerf.objects.tabletop import TabletopObject, colour, description, sample_objects, signed_distance
 from probnerf.objects.tabletop_sampler import CARTON
 from probnerf.training.shape_set import (
@@ -25,7 +24,7 @@ from probnerf.training.shape_set import (
     joined,
     nearest,
 )
-from probnerf.types import BASE_Z
+from probnerf.types import BASE_Z, KINDS
 
 _HANDLE_SHARE = 4  # one in this many is drawn around the handle, which fills a hundredth of the cube
 

@@ -9,7 +9,7 @@ import trimesh
 pytest.importorskip("igl")
 pytest.importorskip("manifold3d")
 
-from probnerf.objects.shape_kinds import KINDS, kind_of_name
+from probnerf.objects.shape_kinds import kind_of_name
 from probnerf.training.mesh_shapes import (
     PAINTS,
     folder_shapes,
@@ -20,6 +20,7 @@ from probnerf.training.mesh_shapes import (
     variant,
 )
 from probnerf.training.shape_set import CLIP, GRID, ShapeSet, centres, draw_shapes, in_cube, load_shapes
+from probnerf.types import KINDS
 
 
 @pytest.fixture(scope="module")

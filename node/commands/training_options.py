@@ -1,0 +1,60 @@
+"""Options of the commands that train (as `options`: only modules without JAX are imported here)."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from probnerf.training.settings import PosteriorTrainConfig, TrainConfig
+
+
+@dataclass(frozen=True)
+class Training:
+    """Train a prior on procedural objects and meshes, or on pictures of your own; resumes by itself after a stop."""
+
+    out: Path = Path("runs/tabletop")
+    """Folder of the run: checkpoint, history, curves.png and, in the end, prior.safetensors."""
+    preset: Literal["household", "small", "paper", "tiny"] = "small"
+    """Sizes of the model: small (vessels and cartons), household (all kinds of things), the paper's, or tiny for a
+    trial."""
+    start: Path | None = None
+    """Initial weights, of the same preset. Give --frozen-steps with it, unless NAME.recognition.safetensors lies beside
+    it. Random by default."""
+    objects: int = 40_000
+    """Vessels and cartons: the first seeds of the tabletop family."""
+    household: int = 0
+    """Things of the household generator: its first seeds. This and --meshes need the extra packages of
+    `farside[meshes]`."""
+    meshes: tuple[Path, ...] = ()
+    """Folders of meshes to learn from (.glb, .gltf, .obj, .ply, .stl; metres; y is up in .glb and .gltf, z in the
+    others). One class of names in ten is left for validation."""
+    variants: int = 8
+    """Variants of each mesh, stretched and in other resting poses; a household thing gets a quarter of them."""
+    pictured: int = 4_000
+    """How many of them, from the first, are also seen in pictures."""
+    data: Path | None = None
+    """Train on the posed pictures in this folder alone (SRN layout, as `farside capture` writes it), not on tabletop
+    objects. Every step is one of rays then: --solid-steps is 0, --learning-rate holds throughout, and --objects and
+    --pictured are not read."""
+    pictures: int | None = None
+    """Pictures of each of them; 8 by default, or all with --data."""
+    recipe: tyro.conf.OmitArgPrefixes[TrainConfig] = field(default_factory=TrainConfig)
+
+
+@dataclass(frozen=True)
+class NetworkTraining:
+    """Train a prior's posterior network on simulated pictures of the objects that it learnt; resumes after a stop."""
+
+    run: Path = Path("runs/tabletop")
+    """Folder of a finished run of `farside train`. It gets the pictures, network/ (checkpoint, history, curves.png)
+    and, in the end, prior.network.safetensors."""
+    plain: int = 100_000
+    """Plain pictures: one object alone, cheap to draw. They teach how whole shapes look."""
+    pictures: int = 20_000
+    """Pictures of scenes, as perception sees them; those that it refuses count. All are kept for later runs."""
+    image_size: int = 32
+    """Pixels a side of a picture."""
+    processes: int | None = None
+    """How many processes draw pictures; all processors by default."""
+    recipe: tyro.conf.OmitArgPrefixes[PosteriorTrainConfig] = field(default_factory=PosteriorTrainConfig)
