@@ -125,6 +125,10 @@ def _shapes(draw: st.DrawFn) -> dict[str, Any]:
     }
 
 
+def _of_sum_1(values: dict[str, float]) -> dict[str, float]:
+    return {name: value / sum(values.values()) for name, value in values.items()}
+
+
 def hypotheses(**own: Any) -> st.SearchStrategy[Hypotheses]:
     """Any hypotheses; `own` replaces the strategies of fields."""
     usual: dict[str, Any] = {
@@ -132,6 +136,7 @@ def hypotheses(**own: Any) -> st.SearchStrategy[Hypotheses]:
         "object_frame": object_frames(),
         "T_world_camera": st.none() | poses(),
         "diagnostics": st.builds(AnswerDiagnostics, **{f.name: st.floats() for f in fields(AnswerDiagnostics)}),
+        "kinds": st.dictionaries(texts, st.floats(0.01, 1.0), max_size=4).map(_of_sum_1),
     }
     return every_field(Hypotheses, _shapes(), **(usual | own))
 

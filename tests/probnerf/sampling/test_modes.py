@@ -128,10 +128,11 @@ def test_gaussians_stand_on_modes_as_wide_as_the_posterior_and_the_prior_is_amon
     ("condition", "depth"),
     [
         ("hidden", True),
-        pytest.param("half", False, marks=pytest.mark.slow),
-        pytest.param("seen", True, marks=pytest.mark.slow),
+        ("half", False),
+        ("seen", True),
     ],
 )
+@pytest.mark.slow
 @pytest.mark.usefixtures("optimised")
 def test_tempering_from_the_modes_is_the_posterior_by_brute_force(condition, depth):
     args = scene(condition, depth)
