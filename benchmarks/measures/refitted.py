@@ -2,7 +2,7 @@
 
 This asks the decoder alone, not the camera: 600 Adam steps on samples of the occupancy (as training draws them) plus
 the log prior, from the shape that recognition tells where it is kept beside the prior, else from the best of a few
-random starts, which end in poorer modes. Truth and reconstruction are walls of 64^3 voxels (a voxel of which a
+random starts. Truth and reconstruction are walls of 64^3 voxels (a voxel of which a
 corner is in the solid) through the same operator (`occupancy.solid`).
 """
 

@@ -37,7 +37,7 @@ from probnerf.training.shape_set import ShapeSet, load_shapes
 from probnerf.training.srn_dataset import read_views
 from probnerf.training.tabletop_shapes import tabletop_shapes
 
-LEARNT = "learnt.json"  # in the run's folder: which objects it learns
+LEARNT = "learnt.json"  # in the folder of a finished run: which objects it learnt
 TABLETOP_SHARE = 0.4  # of a batch, where there are other things; these share the rest by their numbers
 
 
@@ -91,6 +91,9 @@ def train(options: Training, out: Console, err: Console) -> bool:
     save_prior(weights, state.model, story, half=preset.name == "household")
     if options.data is None:
         save_recognition(recognition_path(weights), state.recognition, load_prior(weights).hash)
+        learnt = {name: getattr(options, name) for name in ("objects", "household", "variants")}
+        learnt["meshes"] = [os.path.relpath(meshes, folder) for meshes in options.meshes]
+        write_whole(folder / LEARNT, json.dumps(learnt, indent=1).encode())
     out.print(f"{weights}; judge it with `farside bench prior --prior {weights}`", highlight=False, soft_wrap=True)
     return True
 
@@ -108,8 +111,8 @@ def drawn_curves(folder: Path, out: Console) -> Iterator[None]:
 
 
 def learnt_objects(run: Path) -> dict[str, Any]:
-    """Which objects the run of this folder learns: `objects`, `household`, `variants` and `meshes` of its options, the
-    last as paths from the folder.
+    """Which objects the finished run of this folder learnt: `objects`, `household`, `variants` and `meshes` of its
+    options, the last as paths from the folder.
 
     Raises FileNotFoundError if the run does not tell.
     """
@@ -131,9 +134,6 @@ def _material(
         reading = progress.add_task("objects", total=None)
         views = read_views(options.data, size, options.pictures, advance(reading))
         return [], views, {"family": "srn", "data": options.data.name, "objects": len(views.seeds)}
-    learnt = {name: getattr(options, name) for name in ("objects", "household", "variants")}
-    learnt["meshes"] = [os.path.relpath(meshes, options.out) for meshes in options.meshes]
-    write_whole(options.out / LEARNT, json.dumps(learnt, indent=1).encode())
     sampling = progress.add_task("objects", total=options.objects)
     seeds = np.asarray(TRAIN_SEEDS[: options.objects])
     tabletop = _kept(
