@@ -24,7 +24,7 @@ from perception.answers.hypotheses import Hypotheses
 from perception.inference.limits import NO_CALLBACKS, NO_LIMITS, Callbacks, Limits
 from perception.inference.publish import ConditionedView, published
 from perception.inference.run_plan import Findings, runs_wanted
-from perception.inference.settings import ControllerConfig
+from perception.inference.settings import ControllerConfig, PublishConfig
 from perception.inference.view_sampler import ViewSampler
 from perception.observation.object_frame import ObjectFrame
 from perception.observation.rays import observe
@@ -67,7 +67,7 @@ def estimate(
     on_stage: Callable[[StageInfo], bool | None] | None = None,
     on_answer: Callable[[Hypotheses], None] | None = None,
 ) -> Estimate:
-    """Hypotheses about one object of a frame; first ones, of fewer shapes, go to `on_answer` while it works.
+    """Hypotheses about one object of a frame; first ones, made more cheaply, go to `on_answer` while it works.
 
     With `stages` and no budget the answer is a function of the inputs alone. `known` is the object's own cube where its
     pose is known already (the handle at +x), so that only its shape is inferred.
@@ -160,11 +160,11 @@ class _Publisher:
         """The answer of several runs together."""
         self._whole = True
         power = self.sampler.smc.evidence_power
-        return self._published(pooled(runs, power), self.config.hypotheses, power)
+        return self._published(pooled(runs, power), self.config, power)
 
     def publish_draws(self, draws: Posterior) -> Hypotheses:
         """The answer of weighed draws, whose weights are those of the posterior."""
-        return self._published(draws, self.config.hypotheses, 1.0)
+        return self._published(draws, self.config, 1.0)
 
     def hand_out(self, answer: Hypotheses) -> None:
         """Pass an answer on, if anyone listens."""
@@ -209,14 +209,15 @@ class _Publisher:
         return f"{runs * self.sampler.smc.populations} x {self.sampler.smc.particles} particles"
 
     def _hand_out_early(self, posterior: Posterior) -> None:
-        """An answer of fewer shapes."""
-        begun = time.monotonic()
-        self.hand_out(self._published(posterior, self.config.first_hypotheses, self.sampler.smc.evidence_power))
+        """An answer that is cheaper to make."""
+        begun, config = time.monotonic(), self.config
+        cheaper = replace(config, hypotheses=config.first_hypotheses, coarse=config.first_coarse)
+        self.hand_out(self._published(posterior, cheaper, self.sampler.smc.evidence_power))
         self._early_at = time.monotonic()
         self._early_s = self._early_at - begun
 
-    def _published(self, posterior: Posterior, count: int, evidence_power: float) -> Hypotheses:
-        sampler, config = self.sampler, replace(self.config, hypotheses=count)
+    def _published(self, posterior: Posterior, config: PublishConfig, evidence_power: float) -> Hypotheses:
+        sampler = self.sampler
         with sampler.stopwatch.part("publishing"):
             h = published(
                 sampler.view, posterior, sampler.likelihood, sampler.prior, config, sampler.seed,

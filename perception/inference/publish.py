@@ -57,7 +57,7 @@ def published(
         camera = jnp.asarray(cube.to_cube(np.zeros(3)), jnp.float32)
         positions = scaled_about(prior.model, positions, pose_sigma, camera, drawn[jnp.asarray(chosen)])
     region = answered_voxels(view.frame, view.segment, cube, config.grid)
-    opacity = opacity_grids(prior.model, sizeless, positions, pose_sigma, jax.device_put(region))
+    opacity = opacity_grids(prior.model, sizeless, positions, pose_sigma, jax.device_put(region), coarse=config.coarse)
     pose = poses(prior.model, sizeless, positions, pose_sigma)
     d = posterior.diagnostics
     draft = Hypotheses(

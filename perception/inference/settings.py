@@ -13,6 +13,7 @@ class PublishConfig:
 
     hypotheses: int = 48  # shapes published
     grid: int = 64  # voxels per axis, G
+    coarse: int = 1  # along each axis, shapes are evaluated at every so-many-th corner and interpolated between them
     out_of_model_below: float = 0.90  # mean share of informative pixels explained; validation objects: 0.91 and more
 
     def __post_init__(self) -> None:
@@ -20,6 +21,8 @@ class PublishConfig:
             raise ValueError(f"hypotheses is {self.hypotheses}; give 1 or more")
         if not 1 <= self.grid <= 512:
             raise ValueError(f"grid is {self.grid}; give 1 to 512")
+        if self.coarse < 1:
+            raise ValueError(f"coarse is {self.coarse}; give 1 or more")
 
 
 @dataclass(frozen=True)
@@ -28,15 +31,17 @@ class ControllerConfig(PublishConfig):
 
     infer: InferConfig = field(default_factory=InferConfig)  # of one run
     observe: ObserveConfig = field(default_factory=ObserveConfig)
-    first_hypotheses: int = 8  # published while better ones are under way
+    first_hypotheses: int = 48  # published while better ones are under way
+    first_coarse: int = 2  # their `coarse`: 48 shapes at 2 cost less than 8 at 1
     unexplained: float = 0.1  # share of pixels above which all runs are made
     tolerance: float = 0.005  # nats per voxel of unseen space; accepted loss from having few populations
     runs: int = 4  # at most
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if min(self.first_hypotheses, self.runs) < 1:
-            raise ValueError(f"first_hypotheses {self.first_hypotheses} and runs {self.runs} must be 1 or more")
+        if min(self.first_hypotheses, self.first_coarse, self.runs) < 1:
+            first = f"first_hypotheses {self.first_hypotheses}, first_coarse {self.first_coarse}"
+            raise ValueError(f"{first} and runs {self.runs} must be 1 or more")
         if not (self.tolerance >= 0.0 and 0.0 <= self.unexplained <= 1.0):
             raise ValueError(f"tolerance {self.tolerance:g} must be 0 or more, unexplained {self.unexplained:g} 0 to 1")
 

@@ -197,7 +197,7 @@ def test_frames_of_a_mug_add_up_as_they_should() -> None:
     first = frame_from(0.0)
     begun = tracker.update(first, segment(first)[0], stages=40, on_answer=answers.append)
     assert begun.change == "new" and begun.hypotheses.result == "converged"
-    # first answers came before the last, from fewer shapes, and say so
+    # first answers came before the last, and say so
     assert answers[-1] is begun.hypotheses and len(answers) >= 2
     assert answers[0].result == "underway" and answers[0].stage < begun.hypotheses.stage
     assert answers[0].diagnostics.beta < 1 <= begun.hypotheses.diagnostics.beta
