@@ -34,8 +34,8 @@ from probnerf.training import posterior_flow as training
 def train_network(options: NetworkTraining, out: Console, err: Console) -> bool:
     """Train, or continue an earlier run of the same recipe. False after Ctrl-C.
 
-    Raises FileNotFoundError if the run has no finished prior, ValueError if its network was trained by another recipe,
-    FloatingPointError if the loss is not finite.
+    Raises FileNotFoundError if the run has no finished prior, ValueError if its network was trained by another recipe
+    or training cannot begin at the given one, FloatingPointError if the loss is not finite.
     """
     require_mesh_libraries()
     # only here: it needs them
@@ -56,6 +56,7 @@ def train_network(options: NetworkTraining, out: Console, err: Console) -> bool:
     )
     told = zlib.crc32(json.dumps([learnt, options.image_size], sort_keys=True).encode())
     size = NetworkSizes(latent=prior.model.latent, image_size=options.image_size)
+    network = _first(options, size)
     processes = options.processes or os.cpu_count() or 1
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     state = None
@@ -72,8 +73,6 @@ def train_network(options: NetworkTraining, out: Console, err: Console) -> bool:
                     files.append(path)
                     progress.advance(drawing)
             pictures = picture_set([PicturePart.load(path) for path in sorted(files)], recognition)
-            key = np.array([0, options.recipe.seed], np.uint32)  # a raw key
-            network = PosteriorNetwork(size, key)  # type: ignore[arg-type]
             steps = progress.add_task("steps", total=options.recipe.steps)
             for state, metrics in training.train(  # noqa: B007
                 network, pictures, options.recipe, folder, prior.model.flow
@@ -91,3 +90,21 @@ def train_network(options: NetworkTraining, out: Console, err: Console) -> bool:
     save_posterior_network(weights, state.average, prior.hash, story)
     out.print(f"{weights}; every command that reads {prior_file} uses it now", highlight=False, soft_wrap=True)
     return True
+
+
+def _first(options: NetworkTraining, size: NetworkSizes) -> PosteriorNetwork:
+    """The network at the first step: random, or `options.start`'s."""
+    if options.start is None:
+        key = np.array([0, options.recipe.seed], np.uint32)  # a raw key
+        return PosteriorNetwork(size, key)  # type: ignore[arg-type]
+    network = load_prior(options.start).network
+    if network is None:
+        raise ValueError(f"--start {options.start} has no posterior network beside it; leave it out to begin at random")
+    if network.sizes != size:
+        other = {
+            k: f"{v} instead of {asdict(size)[k]}" for k, v in asdict(network.sizes).items() if v != asdict(size)[k]
+        }
+        raise ValueError(
+            f"--start {options.start} has a network of other sizes ({other}); leave it out to begin at random"
+        )
+    return network

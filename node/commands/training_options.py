@@ -49,6 +49,8 @@ class NetworkTraining:
     run: Path = Path("runs/tabletop")
     """Folder of a finished run of `farside train`. It gets the pictures, network/ (checkpoint, history, curves.png)
     and, in the end, prior.network.safetensors."""
+    start: Path | None = None
+    """Prior whose posterior network is where training begins: of this run or an earlier one. Random by default."""
     plain: int = 100_000
     """Plain pictures: one object alone, cheap to draw. They teach how whole shapes look."""
     pictures: int = 20_000

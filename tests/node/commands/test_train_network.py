@@ -45,7 +45,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         yield from (folder / f"{'plain' if plain else 'part'} {n}" for n in numbers)
 
     def train(network: Any, pictures: Any, config: PosteriorTrainConfig, folder: Path, prior: Any) -> Iterator:
-        found.update(config=config, pictures=pictures)
+        found.update(config=config, pictures=pictures, network=network)
         yield SimpleNamespace(average=network), {"step": config.steps, "loss": 1.0}
 
     monkeypatch.setattr(training_pictures, "draw_parts", draw_parts)
@@ -82,3 +82,19 @@ def test_a_folder_without_a_finished_run_is_refused(finished: Path, asked: dict,
     save_prior(tmp_path / "prior.safetensors", other, {})
     assert main(["train-network", "--run", str(tmp_path)]) == 1
     assert "belongs to the prior" in capsys.readouterr().err
+
+
+def test_training_begins_at_an_earlier_network(finished: Path, asked: dict, tmp_path: Path, capsys) -> None:
+    arguments = ["train-network", "--pictures", "200", "--plain", "1600", "--image-size", "16", "--steps", "7"]
+    for file in finished.glob("*.*"):
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    (tmp_path / "prior.network.safetensors").unlink(missing_ok=True)
+    prior = str(tmp_path / "prior.safetensors")
+    assert main([*arguments, "--run", str(tmp_path), "--start", prior]) == 1
+    assert "has no posterior network beside it" in capsys.readouterr().err
+    assert main([*arguments, "--run", str(tmp_path), "--seed", "3"]) == 0
+    kept = load_prior(tmp_path / "prior.safetensors").network
+    assert main([*arguments, "--run", str(tmp_path), "--start", prior, "--seed", "4"]) == 0
+    assert all(jax.tree.leaves(jax.tree.map(lambda a, b: (a == b).all(), asked["network"], kept)))
+    assert main([*arguments[:-3], "32", "--run", str(tmp_path), "--start", prior]) == 1
+    assert "{'image_size': '16 instead of 32'}" in capsys.readouterr().err
