@@ -123,9 +123,7 @@ def infer_view(
             found = Findings(len(runs), answer.diagnostics.expected_loss, 1.0 - answer.diagnostics.explained)
             if may_grow and stop is None:
                 wanted = runs_wanted(found, config.runs, config.tolerance, config.unexplained)
-                if len(runs) == 1 and found.unexplained > config.unexplained:
-                    sampler.walls = config.walls
-            log.append(publisher.log_line(found, answer, wanted if stop is None else len(runs)))
+            log.append(publisher.log_line(found, answer.failed, wanted if stop is None else len(runs)))
         if stop is None and len(runs) < wanted:
             stop = sampler.limit_reached()
             if stop is None:  # better ones follow
@@ -136,7 +134,7 @@ def infer_view(
     publisher.hand_out(answer)
     return Estimate(
         hypotheses=answer,
-        posterior=publisher.pooled(runs),
+        posterior=pooled(runs, sampler.smc.evidence_power),
         likelihood=sampler.likelihood,
         observation=view.observation,
         object_frame=view.object_frame,
@@ -161,12 +159,8 @@ class _Publisher:
     def publish_runs(self, runs: list[Posterior]) -> Hypotheses:
         """The answer of several runs together."""
         self._whole = True
-        return self._published(self.pooled(runs), self.config, self.sampler.smc.evidence_power)
-
-    def pooled(self, runs: list[Posterior]) -> Posterior:
-        """All runs as one posterior."""
-        models = [self.sampler.model_of(number) for number in range(len(runs))]
-        return pooled(runs, self.sampler.smc.evidence_power, models)
+        power = self.sampler.smc.evidence_power
+        return self._published(pooled(runs, power), self.config, power)
 
     def publish_draws(self, draws: Posterior) -> Hypotheses:
         """The answer of weighed draws, whose weights are those of the posterior."""
@@ -201,19 +195,14 @@ class _Publisher:
         line += f", halves {draws.apart:.2f} nats apart"
         return line + (": no tempering is needed" if enough else " -> tempering from there")
 
-    def log_line(self, found: Findings, answer: Hypotheses, wanted: int) -> str:
+    def log_line(self, found: Findings, failed: int, wanted: int) -> str:
         """A log line: the findings of the runs so far, and whether more are wanted."""
         line = f"{self._particles(found.runs)}: "
         known = np.isfinite(found.expected_loss)
         line += f"expected loss {found.expected_loss:.4f} nats" if known else "expected loss not known"
         line += f", {100 * found.unexplained:.0f}% of pixels not explained"
-        if answer.failed:
-            line += f", populations that failed and are left out: {answer.failed}"
-        if found.runs > 1 and len(walls := self.sampler.walls) > 1:
-            model = [self.sampler.model_of(int(name) // self.sampler.smc.populations) for name in answer.population]
-            weights = np.bincount(model, weights=answer.weights, minlength=len(walls))
-            each = (f"{wall:g}: {weight:.0%}" for wall, weight in zip(walls, weights, strict=True))
-            line += f"; weights of wall errors, in times the usual: {', '.join(each)}"
+        if failed:
+            line += f", populations that failed and are left out: {failed}"
         return line + (f" -> {self._particles(wanted)}" if wanted > found.runs else "")
 
     def _particles(self, runs: int) -> str:

@@ -33,8 +33,7 @@ class ControllerConfig(PublishConfig):
     observe: ObserveConfig = field(default_factory=ObserveConfig)
     first_hypotheses: int = 48  # published while better ones are under way
     first_coarse: int = 2  # their `coarse`: 48 shapes at 2 cost less than 8 at 1
-    unexplained: float = 0.1  # share of pixels above which all runs are made, with wider walls in turn
-    walls: tuple[float, ...] = (1.0, 2.0, 4.0)  # times the wall error; then the runs' evidence tells how wide walls are
+    unexplained: float = 0.1  # share of pixels above which all runs are made
     tolerance: float = 0.005  # nats per voxel of unseen space; accepted loss from having few populations
     runs: int = 4  # at most
 
@@ -43,8 +42,6 @@ class ControllerConfig(PublishConfig):
         if min(self.first_hypotheses, self.first_coarse, self.runs) < 1:
             first = f"first_hypotheses {self.first_hypotheses}, first_coarse {self.first_coarse}"
             raise ValueError(f"{first} and runs {self.runs} must be 1 or more")
-        if not self.walls or self.walls[0] != 1.0 or not all(1.0 <= wall <= 100.0 for wall in self.walls):
-            raise ValueError(f"walls are {self.walls}; give factors from 1 to 100, the first 1")
         if not (self.tolerance >= 0.0 and 0.0 <= self.unexplained <= 1.0):
             raise ValueError(f"tolerance {self.tolerance:g} must be 0 or more, unexplained {self.unexplained:g} 0 to 1")
 

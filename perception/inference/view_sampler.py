@@ -24,7 +24,7 @@ from probnerf.prior.posterior_network import EncoderPicture
 from probnerf.sampling.hmc import Reference, StageInfo
 from probnerf.sampling.importance import WeighedDraws
 from probnerf.settings import InferConfig, TemperedSMCConfig
-from probnerf.types import KINDS, Observation, Posterior, StopReason
+from probnerf.types import KINDS, Posterior, StopReason
 
 # Two batches of eigenvalues may wait for each other for ever: each holds a thread of XLA's pool, one per core, until
 _ONE_AT_A_TIME = RLock()  # another thread of that pool has done its parts (jaxlib's ParallelBatchMap)
@@ -44,7 +44,6 @@ class ViewSampler:
     seed: int
     limits: Limits  # of all runs together
     before: Posterior | None = None
-    walls: tuple[float, ...] = (1.0,)  # runs assume so many times the wall error, in turn
     stopwatch: Stopwatch = field(default_factory=Stopwatch)
     stages: int = 0  # done
     point_gradients: float = 0.0  # field evaluations with gradient
@@ -172,18 +171,6 @@ class ViewSampler:
                 return runs, run.result
         return runs, None
 
-    def model_of(self, number: int) -> int:
-        """Which of `walls` a run assumes; the very first run assumes the first."""
-        return number % len(self.walls)
-
-    def _observation(self, number: int) -> Observation:
-        """The view's, with ranges as uncertain as the run's wall error makes them."""
-        seen, factor = self.view.observation, self.walls[self.model_of(number)]
-        if factor == 1.0:
-            return seen
-        more = (factor**2 - 1.0) * self.config.wall_sigma**2  # it enters the likelihood in no other way
-        return replace(seen, range_sigma=(seen.range_sigma**2 + more) ** 0.5)
-
     def run(self, number: int, on_stage: Callable[[StageInfo], bool | None]) -> Posterior:
         """One run, with its own random numbers; other threads' runs wait. `on_stage` gets the stages of all runs."""
         self._stage_s = []
@@ -202,7 +189,7 @@ class ViewSampler:
             posterior, _ = infer(
                 jax.random.fold_in(self._key, 10 + number) if number else self._key,
                 self.prior.model,
-                self._observation(number),
+                self.view.observation,
                 self.config,
                 reference=self._reference,
                 before=self.before,

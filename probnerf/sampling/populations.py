@@ -15,7 +15,6 @@ from probnerf.types import Diagnostics, Posterior, StopReason, on_device
 # Populations in different good modes differ by a few nats, mostly noise. On validation views this threshold made no
 # answer worse. Below 30 nats, answers became overconfident.
 FAILED = 100.0
-LEAST_SHARE = 0.01  # of a model, if runs sampled several
 
 
 def shares(
@@ -36,29 +35,6 @@ def shares(
     fit = log_evidences > log_evidences.max() - FAILED
     share[fit] = power * (log_evidences[fit] - mean)
     return share - np.logaddexp.reduce(share), mean
-
-
-def _shares_of_models(
-    log_evidences: Float[np.ndarray, "m"], models: Int[np.ndarray, "m"], power: float
-) -> tuple[Float[np.ndarray, "m"], float, float]:
-    """`shares` within each population's model, times the model's share: its evidence, as all are as likely before.
-
-    Then the log of the models' mean evidence, and its relative standard error from the spread within each. A model with
-    less than `LEAST_SHARE` is left out: among a few published shapes its own would stand for next to nothing.
-    """
-    names = np.unique(models)
-    share, means = np.empty(len(log_evidences)), np.empty(len(names))
-    for i, name in enumerate(names):
-        share[models == name], means[i] = shares(log_evidences[models == name], power)
-    between, mean = shares(means, 1.0)
-    between = np.where(between < np.log(LEAST_SHARE), -np.inf, between)
-    between = between - np.logaddexp.reduce(between)
-    variance = 0.0
-    for i, name in enumerate(names):
-        share[models == name] += between[i]
-        ratio = np.exp(log_evidences[models == name] - mean)
-        variance += np.var(ratio, ddof=1) / len(ratio)
-    return share, float(mean), float(np.sqrt(variance) / len(names))
 
 
 def gathered(
@@ -146,23 +122,21 @@ def from_draws(
     )
 
 
-def pooled(posteriors: Sequence[Posterior], evidence_power: float, models: Sequence[int] | None = None) -> Posterior:
+def pooled(posteriors: Sequence[Posterior], evidence_power: float) -> Posterior:
     """Combine independent tempered SMC runs into one posterior with all their populations.
 
-    All runs have reached beta = 1 with the same sizes, and on the same target, or on that of the model that `models`
-    names for each: then the models' shares of the weight are their evidences. Acceptance and `result` come from the
+    All runs have reached beta = 1, on the same target and with the same sizes. Acceptance and `result` come from the
     last run. Counts are summed. The error of the evidence is estimated from the spread of the populations.
     """
     if len(posteriors) == 1:
         return posteriors[0]
     m = len(posteriors[0].diagnostics.log_evidences)
     estimates = np.concatenate([np.asarray(p.diagnostics.log_evidences, np.float64) for p in posteriors])
-    share, log_evidence, spread = _shares_of_models(
-        estimates, np.repeat([0] * len(posteriors) if models is None else models, m), evidence_power
-    )
+    share, log_evidence = shares(estimates, evidence_power)
     population = np.concatenate([np.asarray(p.population) + m * i for i, p in enumerate(posteriors)])
     values = np.concatenate([np.asarray(p.log_likelihoods) for p in posteriors])
     log_weights = share[population] - np.log(len(values) / len(estimates))
+    spread = np.std(np.exp(estimates - log_evidence), ddof=1) / np.sqrt(len(estimates))
     by_population = values[np.argsort(population, kind="stable")].reshape(len(estimates), -1)
     every = [p.diagnostics for p in posteriors]
 

@@ -39,20 +39,16 @@ class Sampler:
     """Stands for the sampler and for what publishes its samples: each further run lessens the expected loss."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *results: StopReason) -> None:
-        self.results, self.made, self.walls, self.explained = results, list[int](), list[float](), 1.0
+        self.results, self.made, self.stages = results, list[int](), list[int]()
         monkeypatch.setattr("perception.inference.view_sampler.infer", self.infer)
         monkeypatch.setattr("perception.inference.view_sampler.crossings_of", lambda *_: 1)
         monkeypatch.setattr(ViewSampler, "likelihood", None)
-        monkeypatch.setattr(ViewSampler, "_observation", lambda own, number: own.walls[own.model_of(number)])
         monkeypatch.setattr("perception.inference.controller.pooled", self.pooled)
         monkeypatch.setattr("perception.inference.controller.published", self.published)
 
-    def infer(
-        self, _: Any, __: Any, walls: float, *___: Any, on_stage: Callable[[StageInfo], bool | None], **____: Any
-    ) -> tuple[Runs, None]:
+    def infer(self, *_: Any, on_stage: Callable[[StageInfo], bool | None], **__: Any) -> tuple[Runs, None]:
         number = len(self.made)
         self.made.append(number)
-        self.walls.append(walls)
         samples: Any = Runs((number,), StopReason.UNDERWAY)
         for stage in range(STAGES + 1):
             if on_stage(StageInfo(stage, (nan,), (nan,), (nan,), (nan,), (nan,), 0, 0.0, lambda: samples)):
@@ -60,14 +56,14 @@ class Sampler:
         return Runs((number,), self.results[number]), None
 
     @staticmethod
-    def pooled(runs: list[Runs], _: float, models: list[int]) -> Runs:
-        assert len(models) == len(runs) and set(models) in ({0}, set(range(min(len(runs), 3))))
+    def pooled(runs: list[Runs], _: float) -> Runs:
         return Runs(tuple(number for run in runs for number in run.numbers), runs[-1].result)
 
-    def published(self, _: Any, posterior: Runs, *rest: Any, **__: Any) -> Hypotheses:
+    @staticmethod
+    def published(_: Any, posterior: Runs, *rest: Any, **__: Any) -> Hypotheses:
         """What runs an answer is of stands in its label, and in its error whether it is one of few shapes."""
         few = rest[2].hypotheses == CONFIG.first_hypotheses
-        diagnostics = AnswerDiagnostics(expected_loss=0.04 / len(posterior.numbers), explained=self.explained)
+        diagnostics = AnswerDiagnostics(expected_loss=0.04 / len(posterior.numbers), explained=1.0)
         return body_with_handle(
             label=str(posterior.numbers), result=posterior.result, monte_carlo_error=float(few), diagnostics=diagnostics
         )
@@ -132,16 +128,6 @@ def test_as_many_runs_as_the_loss_takes_answer_together(monkeypatch: pytest.Monk
 def test_one_run_is_all_where_its_loss_is_small(monkeypatch: pytest.MonkeyPatch) -> None:
     sampler = Sampler(monkeypatch, WHOLE)
     assert inferred(tolerance=0.05)[1] == [("(0,)", "converged")] and sampler.made == [0]
-
-
-def test_where_pixels_stay_unexplained_walls_are_wider_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    sampler = Sampler(monkeypatch, *[WHOLE] * 4)
-    assert inferred(tolerance=0.0)[0].posterior.numbers == (0, 1, 2, 3) and sampler.walls == [1.0] * 4
-    sampler = Sampler(monkeypatch, *[WHOLE] * 4)
-    sampler.explained = 0.8
-    found, _ = inferred(tolerance=1.0)
-    assert found.posterior.numbers == (0, 1, 2, 3) and sampler.walls == [1.0, 2.0, 4.0, 1.0]
-    assert found.log[1].endswith("; weights of wall errors, in times the usual: 1: 100%, 2: 0%, 4: 0%")
 
 
 def test_what_goes_on_from_an_earlier_posterior_is_one_run(monkeypatch: pytest.MonkeyPatch) -> None:

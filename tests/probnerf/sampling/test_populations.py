@@ -84,36 +84,6 @@ def test_a_population_weighs_by_its_evidence_among_all_runs() -> None:
     np.testing.assert_allclose(total, np.exp(estimates) / np.exp(estimates).sum(), rtol=1e-4)
 
 
-def _raised(run: Posterior, nats: float) -> Posterior:
-    evidences = run.diagnostics.log_evidences + np.float32(nats)
-    return replace(run, diagnostics=replace(run.diagnostics, log_evidences=evidences))
-
-
-def test_models_weigh_by_their_evidence_and_populations_within_one_alike() -> None:
-    runs = [_run(0), _raised(_run(1), 1.0), _run(2)]
-    estimates = np.stack([np.asarray(r.diagnostics.log_evidences, np.float64) for r in runs])
-    means = [np.exp(estimates[[0, 2]]).mean(), np.exp(estimates[1]).mean()]
-    expected = np.repeat(np.array([0.5, 1.0, 0.5]) * np.array(means)[[0, 1, 0]] / np.sum(means), 2) / 2
-    whole = pooled(runs, 0.0, [0, 1, 0])
-    total = np.bincount(np.asarray(whole.population), weights=np.exp(np.asarray(whole.log_weights, np.float64)))
-    np.testing.assert_allclose(total, expected, rtol=1e-4)
-    assert float(whole.log_evidence) == pytest.approx(np.log(np.mean(means)), abs=1e-5)
-    assert 0.0 < float(whole.log_evidence_se) < 1.0
-
-
-def test_a_model_without_evidence_takes_no_published_shape() -> None:
-    whole = pooled([_run(0), _raised(_run(1), -6.0)], 0.0, [0, 1])
-    _, weights, population = thin(whole, 10)
-    assert np.unique(population).tolist() == [0, 1] and len(weights) == 10  # the first run's
-    assert float(whole.log_evidence) == pytest.approx(float(_run(0).log_evidence) - np.log(2.0), abs=0.01)
-
-
-def test_runs_of_one_model_are_pooled_as_ever() -> None:
-    runs = [_run(0), _run(1)]
-    same = zip(jax.tree.leaves(pooled(runs, 0.5)), jax.tree.leaves(pooled(runs, 0.5, [2, 2])), strict=True)
-    assert all(np.array_equal(a, b) for a, b in same)
-
-
 def test_pooled_samples_start_fewer_populations_at_their_own_densities() -> None:
     runs = [_run(0), _run(1)]
     whole = pooled(runs, 1.0)
