@@ -77,7 +77,7 @@ def draw_objects(rng: np.random.Generator, count: int, families: Families) -> li
 def household_object(seed: int, index: int, paint: int) -> LearntObject:
     """A variant of the household generator's object."""
     made = draw_mesh(seed)
-    thing, own = variant(made.mesh, f"{made.name}_{seed}", made.kind, index, NATURAL if made.any_pose else 1.0)
+    thing, own = variant(made.mesh, f"{made.name}_{seed}", made.kind, index, NATURAL if made.any_pose else 1.0, 0.0)
     return _learnt(thing, own, paint, HOUSEHOLD)
 
 

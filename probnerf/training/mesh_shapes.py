@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from probnerf.objects.free_form import bent
 from probnerf.objects.household import draw_mesh
 from probnerf.objects.mesh import MeshObject, canonical, read_folder, rests
 from probnerf.objects.paint import Paint, draw_paint
@@ -33,6 +34,8 @@ from probnerf.types import BASE_Z, KINDS
 PAINTS = 4  # of each mesh
 STRETCH = 0.12  # standard deviation of each axis's log scale, of all variants but the first
 NATURAL = 0.4  # share of the variants that stand as their mesh does; the others as they fall
+BEND = 0.2  # of the box's sides: how far the control points of a bent mesh move
+BENT = 0.5  # share of the variants of a folder's mesh that are bent; the generator draws its own
 Progress = Callable[[int, int], None]
 
 
@@ -42,11 +45,18 @@ def held_out(name: str, share: int = 10) -> bool:
 
 
 def variant(
-    mesh: trimesh.Trimesh, name: str, kind: str, index: int, natural: float = NATURAL
+    mesh: trimesh.Trimesh, name: str, kind: str, index: int, natural: float = NATURAL, bend: float = BENT
 ) -> tuple[MeshObject, int]:
-    """A variant of a mesh in its canonical frame, and its seed, which name and index fix. The first is the mesh."""
+    """A variant of a mesh in its canonical frame, and its seed, which name and index fix. The first is the mesh.
+
+    Others are stretched and stand or fall; a share of `bend` is bent before, and half of these mirrored.
+    """
     seed = zlib.crc32(f"{name}/{index}".encode())
     if index:
+        rng = np.random.default_rng([seed, 59])
+        if rng.random() < bend:
+            mesh = bent(mesh, rng, BEND)
+            mesh.apply_transform(np.diag([rng.choice([-1.0, 1.0]), 1.0, 1.0, 1.0]))
         mesh = rests(mesh, np.random.default_rng([seed, 47]), natural, STRETCH)
     return canonical(mesh.vertices, mesh.faces, kind, name), seed
 
@@ -79,7 +89,8 @@ def household_shapes(seeds: range, variants: int, progress: Progress | None = No
             thing = draw_mesh(seed)
             natural = NATURAL if thing.any_pose else 1.0
             yield from (
-                _sample(*variant(thing.mesh, f"{thing.name}_{seed}", thing.kind, v, natural)) for v in range(variants)
+                _sample(*variant(thing.mesh, f"{thing.name}_{seed}", thing.kind, v, natural, bend=0.0))
+                for v in range(variants)
             )
             if progress is not None:
                 progress(done, len(seeds))
