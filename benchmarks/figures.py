@@ -21,7 +21,7 @@ ORDER = {
     "The prior": ("prior",),
     "Unseen space": ("calibration", "handle", "hidden"),
     "A real frame": ("frame",),
-    "Strangers": ("out_of_model", "strangers"),
+    "Strangers": ("out_of_model", "strangers", "kinds"),
     "The sampler alone": ("sbc", "chains", "acceptance"),
     "What it is worth to a planner": ("reach", "query", "next_view"),
     "Faults": ("stability",),

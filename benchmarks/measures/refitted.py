@@ -6,9 +6,7 @@ random starts. Truth and reconstruction are walls of 64^3 voxels (a voxel of whi
 corner is in the solid) through the same operator (`occupancy.solid`).
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -18,17 +16,14 @@ from scipy import ndimage
 
 from benchmarks.measures.metrics import iou, recall
 from probnerf.likelihood.settings import Likelihood
-from probnerf.objects.household import draw_mesh
-from probnerf.objects.mesh import MeshObject, read_folder
-from probnerf.objects.shape_kinds import kind_of_name
-from probnerf.objects.tabletop import VALIDATION_SEEDS
+from probnerf.objects.mesh import MeshObject
 from probnerf.prior.networks import ProbNeRF, Recognition
 from probnerf.rendering import foam
 from probnerf.rendering.occupancy import solid
 from probnerf.sampling.ascent import ascend
 from probnerf.settings import AdamConfig
 from probnerf.shapes import opacity_grids
-from probnerf.training.mesh_shapes import held_out, sample_mesh, variant
+from probnerf.training.mesh_shapes import sample_mesh
 from probnerf.training.shape_set import batch_of
 from probnerf.types import BODY_EXTENT
 
@@ -48,17 +43,6 @@ class Refitted:
     thin: float  # share of the voxels of parts below 1 cm that are recalled; NaN without such parts
     solid: Bool[np.ndarray, "G G G"]
     true_solid: Bool[np.ndarray, "G G G"]
-
-
-def held_out_things(count: int, folders: dict[str, tuple[Path, bool]]) -> Iterator[tuple[str, MeshObject, int]]:
-    """Source, object and seed: `count` of the generator, and those of each folder (its held-out classes, or all)."""
-    for seed in VALIDATION_SEEDS[:count]:
-        made = draw_mesh(seed)
-        yield "generator", *variant(made.mesh, f"{made.name}_{seed}", made.kind, 0)
-    for source, (folder, whole) in folders.items():
-        for name, mesh in read_folder(folder) if folder.is_dir() else ():
-            if not isinstance(mesh, str) and (whole or held_out(name)):
-                yield source, *variant(mesh, name, kind_of_name(name), 0)
 
 
 def refit(

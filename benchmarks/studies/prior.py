@@ -37,11 +37,6 @@ from probnerf.settings import AdamConfig
 
 PSNR_DB, IOU, RECALLED = 25.0, 0.8, 0.9  # the gate
 HOUSEHOLD_IOU, LEAST_IOU, LEAST_SHARE, THIN_RECALLED = 0.85, 0.7, 0.9, 0.8  # of household things
-_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-FOLDERS = {  # the second: whether all of it is held out
-    "held-out meshes": (_DATA / "train_meshes" / "base_meshes", False),
-    "scans": (_DATA / "val_meshes" / "gso", True),
-}
 
 
 def figures(rebuilt: Sequence[Rebuilt]) -> dict[str, float | bool]:
@@ -105,10 +100,11 @@ def main(options: Options) -> Summary:
 
 def _household(prior: Prior, recognition: Recognition | None, count: int) -> tuple[list[Row], Table]:
     """Figures of household things: of each source, and of all."""
-    from benchmarks.measures.refitted import held_out_things, refit  # it needs the extra `meshes`
+    from benchmarks.measures.refitted import refit  # these need the extra `meshes`
+    from benchmarks.scenes.held_out import held_out_things
 
     fitted = []
-    for source, thing, seed in held_out_things(count, FOLDERS):
+    for source, thing, seed in held_out_things(count):
         one = refit(prior.model, source, thing, seed, recognition)
         fitted.append(one)
         say(f"{len(fitted):4d} {source:16s} {one.name:28s} iou {one.iou:.3f}, thin parts {one.thin:.2f}")

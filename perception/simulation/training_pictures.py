@@ -75,7 +75,18 @@ def draw_part(
 ) -> tuple[PicturePart, Counter[str]]:
     """One part: so many views of each of its objects, less those that perception refuses, and its reasons."""
     rng = np.random.default_rng([number, 71])
-    things = draw_objects(rng, objects, families)
+    return draw_views(rng, draw_objects(rng, objects, families), views, size, draws, looks)
+
+
+def draw_views(
+    rng: np.random.Generator,
+    things: Sequence[LearntObject],
+    views: int,
+    size: int,
+    draws: ExampleDraws | None = None,
+    looks: ViewDraws | None = None,
+) -> tuple[PicturePart, Counter[str]]:
+    """So many views of each of these objects among others of them, less those that perception refuses."""
     shapes = [MeshShape(t.vertices, t.faces, t.half_extent, t.colours, lit=True) for t in things]
     pictures, rows, reasons = [], [], Counter[str]()
     for row, shape in enumerate(shapes):
@@ -134,9 +145,11 @@ def draw_parts(
             raise
 
 
-def picture_set(parts: Sequence[PicturePart], recognition: Recognition) -> PictureSet:
-    """The parts' pictures with their objects' latents, as recognition tells them."""
-    latents = recognised(recognition, [part.description for part in parts])
+def picture_set(parts: Sequence[PicturePart], recognition: Recognition | None) -> PictureSet:
+    """The parts' pictures with their objects' latents, as recognition tells them (without one: none, K = 0)."""
+    described = [part.description for part in parts]
+    nothing = ((np.zeros((len(each), 0), np.float32),) * 2 for each in described)
+    latents = list(nothing) if recognition is None else recognised(recognition, described)
     kept = {f.name for f in fields(PictureSet)} & {f.name for f in fields(PicturePart)} - {"kind"}
     owner = [(part.family.astype(np.int64) << 40) + part.seed for part in parts]
     return PictureSet(
@@ -181,7 +194,7 @@ def _training_picture(example: Example) -> TrainingPicture:
     )
 
 
-def _part(pictures: list[TrainingPicture], rows: np.ndarray, things: list[LearntObject]) -> PicturePart:
+def _part(pictures: list[TrainingPicture], rows: np.ndarray, things: Sequence[LearntObject]) -> PicturePart:
     def stacked(name: str, kind: type) -> np.ndarray:
         return np.stack([np.asarray(getattr(picture, name)) for picture in pictures]).astype(kind)
 

@@ -39,9 +39,7 @@ def least_volume(control: Control) -> float:
     b = [_bernstein(_GRID[:, axis]) for axis in range(3)]
     slope = [_bernstein_slope(_GRID[:, axis]) for axis in range(3)]
     columns = [
-        np.einsum(
-            "ni,nj,nk,ijkc->nc", *[slope[a] if a == axis else b[a] for a in range(3)], control, optimize=True
-        )
+        np.einsum("ni,nj,nk,ijkc->nc", *[slope[a] if a == axis else b[a] for a in range(3)], control, optimize=True)
         for axis in range(3)
     ]
     return float(np.linalg.det(np.eye(3) + np.stack(columns, axis=-1)).min())

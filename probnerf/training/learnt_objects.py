@@ -60,7 +60,7 @@ def draw_objects(rng: np.random.Generator, count: int, families: Families) -> li
     others = household + len(meshes) * families.folder_variants
     tabletop = int(rng.binomial(count, families.tabletop_share if others else 1.0))
     start, stop = families.tabletop.start, families.tabletop.stop
-    drawn = _tabletop(rng.integers(start, stop, tabletop)) if tabletop else []
+    drawn = tabletop_objects(rng.integers(start, stop, tabletop)) if tabletop else []
     for _ in range(count - tabletop):
         pick = int(rng.integers(others))
         if pick < household:
@@ -70,7 +70,7 @@ def draw_objects(rng: np.random.Generator, count: int, families: Families) -> li
             which, index = divmod(pick - household, families.folder_variants)
             name, mesh = meshes[which]
             thing, seed = variant(mesh, name, kind_of_name(name), index)
-            drawn.append(_learnt(thing, seed, int(rng.integers(PAINTS)), FOLDER))
+            drawn.append(learnt(thing, seed, int(rng.integers(PAINTS)), FOLDER))
     return drawn
 
 
@@ -78,10 +78,11 @@ def household_object(seed: int, index: int, paint: int) -> LearntObject:
     """A variant of the household generator's object."""
     made = draw_mesh(seed)
     thing, own = variant(made.mesh, f"{made.name}_{seed}", made.kind, index, NATURAL if made.any_pose else 1.0, 0.0)
-    return _learnt(thing, own, paint, HOUSEHOLD)
+    return learnt(thing, own, paint, HOUSEHOLD)
 
 
-def _learnt(thing: MeshObject, seed: int, paint: int, family: int) -> LearntObject:
+def learnt(thing: MeshObject, seed: int, paint: int, family: int) -> LearntObject:
+    """An object in its canonical frame, as perception may misplace it, in one of its paints."""
     thing = placed(thing, np.random.default_rng([seed, 43]))
     description = _description(sample_mesh(thing, seed), 0, paint)
     colours = paint_of(seed, paint).rgb
@@ -99,7 +100,7 @@ def _meshes(folder: Path) -> Sequence[tuple[str, trimesh.Trimesh]]:
     return [(name, mesh) for name, mesh in read_folder(folder) if not isinstance(mesh, str) and not held_out(name)]
 
 
-def _tabletop(seeds: np.ndarray) -> list[LearntObject]:
+def tabletop_objects(seeds: np.ndarray) -> list[LearntObject]:
     shapes, made = tabletop_shapes(seeds), []
     for row, seed in enumerate(seeds):
         obj = sample_object(int(seed))

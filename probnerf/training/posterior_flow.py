@@ -60,16 +60,29 @@ def log_densities(
         parts = network.log_density_parts(features, yaw[None], pose[None], z[None])
         return *(part[0] for part in parts), features.log_kinds[kind]
 
-    seen = examples.picture
-    seen = replace(
+    seen = _as_floats(examples.picture)
+    told = (examples.pose_sigma, examples.known, examples.yaw, examples.pose, z_tilde, examples.kind)
+    yaw, pose, shape, kind = jax.vmap(one)(seen, *told)
+    return (1.0 - examples.known) * yaw, (1.0 - examples.known) * pose, shape, kind
+
+
+@eqx.filter_jit
+def log_kinds(network: PosteriorNetwork, examples: Examples) -> Float[Array, "b kinds"]:
+    """Logarithms of the probabilities of `KINDS` for each example."""
+
+    def one(picture: EncoderPicture, sigma, given):
+        return network.features(picture, sigma, given=given).log_kinds
+
+    return jax.vmap(one)(_as_floats(examples.picture), examples.pose_sigma, examples.known)
+
+
+def _as_floats(seen: EncoderPicture) -> EncoderPicture:
+    return replace(
         seen,
         rgb=seen.rgb / 255.0,
         distance=seen.distance.astype(jnp.float32),
         unknown=seen.unknown.astype(jnp.float32),
     )
-    told = (examples.pose_sigma, examples.known, examples.yaw, examples.pose, z_tilde, examples.kind)
-    yaw, pose, shape, kind = jax.vmap(one)(seen, *told)
-    return (1.0 - examples.known) * yaw, (1.0 - examples.known) * pose, shape, kind
 
 
 def loss(

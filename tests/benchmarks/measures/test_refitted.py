@@ -8,7 +8,8 @@ import trimesh
 pytest.importorskip("igl")
 pytest.importorskip("manifold3d")
 
-from benchmarks.measures.refitted import GRID, held_out_things, refit, thin_parts, walls
+from benchmarks.measures.refitted import GRID, refit, thin_parts, walls
+from benchmarks.scenes.held_out import held_out_things
 from probnerf.objects.mesh import canonical
 from probnerf.prior.networks import PRESETS, ProbNeRF, Recognition
 from probnerf.rendering.occupancy import voxel_centres
