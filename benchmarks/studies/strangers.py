@@ -192,7 +192,7 @@ def _network_methods(prior: Prior) -> tuple[str, ...]:
 
 
 def _asked(h: Hypotheses, points: Float[np.ndarray, "n 3"], occupied: Bool[np.ndarray, "n"]) -> dict[str, Any]:
-    return _told(np.array(query([h], Points(points), "camera", now_ns=h.stamp_ns).p_occupied), occupied)
+    return _told(np.array(query([h], Points(points), "camera", now_ns=h.stamp_ns).p_occupied_few), occupied)
 
 
 def _told(p: Float[np.ndarray, "n"], occupied: Bool[np.ndarray, "n"]) -> dict[str, Any]:

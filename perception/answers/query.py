@@ -6,7 +6,7 @@ of each, and the probability that a region is free of all is the product over *o
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -46,6 +46,7 @@ class QueryResult:
     # disagree with the rest
     blocked_by: dict[int, list[int]] = field(default_factory=dict)
     p_occupied: list[float] | None = None  # of each point; None for a box
+    p_occupied_few: list[float] | None = None  # the same by the rule of succession, in unseen space
 
     def verdict(self, risk: float = 0.05) -> Verdict:
         """Free or occupied where the hypotheses' chance of being wrong is at most `risk` in (0, 0.5), else unsure.
@@ -62,7 +63,7 @@ class QueryResult:
         return "occupied" if self.p_free_few <= risk else "unsure"
 
     def as_dict(self) -> dict[str, float | dict[str, float] | dict[int, list[int]] | list[float]]:
-        """The fields by name, ready for JSON, without `p_occupied` where it is None."""
+        """The fields by name, ready for JSON, without those of points where there are none."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
 
@@ -97,13 +98,13 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
         touched.append(h)
         p_free.append(float(free))
         p_free_se.append(float(se))
-        n = 1.0 if h.alone else h.effective_hypotheses  # one population counts as one hypothesis
-        p_free_few.append((n * float(free) + 1.0) / (n + 2.0))
+        p_free_few.append(float(_succession(free, h)))
         volumes.append((filled, weights))
         entropies.append(binary_entropy(marginal(h)[index]))
     # Errors of a product of independent factors: sum over objects of (se_o times the other factors)^2.
     others = [np.prod(p_free[:o] + p_free[o + 1 :]) for o in range(len(p_free))]
     unseen, outside = _fractions(scene, region, frame)
+    points = region if isinstance(region, Points) else None
     return QueryResult(
         p_free=float(np.prod(p_free)),
         p_free_se=float(np.linalg.norm(np.multiply(p_free_se, others))),
@@ -115,7 +116,8 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
         effective_hypotheses=min(h.effective_hypotheses for h in touched or scene),
         age_s=((time.time_ns() if now_ns is None else now_ns) - min(h.stamp_ns for h in scene)) * 1e-9,
         blocked_by=blocked_by,
-        p_occupied=_p_occupied(scene, region, frame) if isinstance(region, Points) else None,
+        p_occupied=None if points is None else _p_occupied(scene, points, frame, marginal),
+        p_occupied_few=None if points is None else _p_occupied(scene, points, frame, _marginal_few),
     )
 
 
@@ -136,6 +138,18 @@ def marginal(h: Hypotheses) -> Float[np.ndarray, "V"]:
     """p_occupied of each of the G^3 voxels, cautious where the object is out of model."""
     p = h.p_occupied.ravel()
     return (1 - CAUTION) * p + CAUTION * h.unseen.ravel() if h.out_of_model else p
+
+
+def _marginal_few(h: Hypotheses) -> Float[np.ndarray, "V"]:
+    """`marginal`, by the rule of succession in unseen space. What was seen free is so in every hypothesis."""
+    p = marginal(h)
+    return np.where(h.unseen.ravel(), _succession(p, h), p)
+
+
+def _succession(p: Float[np.ndarray, "..."] | np.floating, h: Hypotheses) -> Float[np.ndarray, "..."]:
+    """(n p + 1) / (n + 2) of n effective hypotheses; one population counts as one."""
+    n = 1.0 if h.alone else h.effective_hypotheses
+    return (n * np.asarray(p) + 1.0) / (n + 2.0)
 
 
 def _region_voxels(
@@ -254,12 +268,14 @@ def _sampled(region: Swept, width: float) -> tuple[Float[np.ndarray, "3 n"], Flo
     return np.concatenate(points, axis=1), np.concatenate(shares)
 
 
-def _p_occupied(scene: Sequence[Hypotheses], region: Points, frame: FrameName) -> list[float]:
+def _p_occupied(
+    scene: Sequence[Hypotheses], region: Points, frame: FrameName, of: Callable[[Hypotheses], np.ndarray]
+) -> list[float]:
     """1 - prod over objects of (1 - p) at each point."""
     free = np.ones(len(region.points))
     for h in scene:
         index = h.voxels(frame, *region.points.T)
-        free *= np.where(index >= 0, 1.0 - marginal(h)[index], 1.0)
+        free *= np.where(index >= 0, 1.0 - of(h)[index], 1.0)
     return (1.0 - free).tolist()
 
 

@@ -160,7 +160,8 @@ class _Publisher:
         """The answer of several runs together."""
         self._whole = True
         power = self.sampler.smc.evidence_power
-        return self._published(pooled(runs, power), self.config, power)
+        guess = self.sampler.guess() if self.sampler.asks_network else None
+        return self._published(pooled(runs, power), self.config, power, guess)
 
     def publish_draws(self, draws: Posterior) -> Hypotheses:
         """The answer of weighed draws, whose weights are those of the posterior."""
@@ -216,11 +217,13 @@ class _Publisher:
         self._early_at = time.monotonic()
         self._early_s = self._early_at - begun
 
-    def _published(self, posterior: Posterior, config: PublishConfig, evidence_power: float) -> Hypotheses:
+    def _published(
+        self, posterior: Posterior, config: PublishConfig, evidence_power: float, guess: Posterior | None = None
+    ) -> Hypotheses:
         sampler = self.sampler
         with sampler.stopwatch.part("publishing"):
             h = published(
                 sampler.view, posterior, sampler.likelihood, sampler.prior, config, sampler.seed,
-                point_gradients=sampler.point_gradients, evidence_power=evidence_power,
+                point_gradients=sampler.point_gradients, evidence_power=evidence_power, guess=guess,
             )  # fmt: skip
         return replace(h, stage=max(sampler.stages, h.stage), kinds=sampler.kinds)

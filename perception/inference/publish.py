@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Array, Bool, Float, Int
 
 from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
@@ -43,19 +43,24 @@ def published(
     seed: int,
     point_gradients: float = float("nan"),
     evidence_power: float = float("nan"),
+    guess: Posterior | None = None,
 ) -> Hypotheses:
-    """The posterior as Hypotheses. The last two arguments become diagnostics of it."""
-    chosen, weights, population = thin(posterior, config.hypotheses)
-    sizeless = without_sizes(likelihood)
-    # NumPy, because the number of samples varies, and nothing may compile for it
-    positions, pose_sigma = jax.device_put(np.asarray(posterior.positions)[chosen]), view.observation.pose_sigma
+    """The posterior as Hypotheses, with draws of `guess` among them where pixels stay unexplained (`_hedged`).
+
+    `point_gradients` and `evidence_power` become diagnostics of it.
+    """
+    positions, weights, population = _thinned(posterior, config.hypotheses)
+    sizeless, pose_sigma = without_sizes(likelihood), view.observation.pose_sigma
     fit = float(weights @ np.asarray(explained(prior.model, sizeless, view.observation, positions), np.float64))
+    if guess is not None and (draws := round(config.hypotheses * (1.0 - fit))):
+        kept = _thinned(posterior, config.hypotheses - draws)
+        positions, weights, population = _hedged(kept, guess.positions, draws)
     cube = view.object_frame
     if cube.sight_sigma > 0.0:  # no pixel informs it, so it is not sampled: each sample draws it from its prior
         key = jax.random.fold_in(jax.random.key(seed), 1)
-        drawn = cube.sight_sigma * jax.random.normal(key, posterior.log_weights.shape)
+        drawn = cube.sight_sigma * jax.random.normal(key, weights.shape)
         camera = jnp.asarray(cube.to_cube(np.zeros(3)), jnp.float32)
-        positions = scaled_about(prior.model, positions, pose_sigma, camera, drawn[jnp.asarray(chosen)])
+        positions = scaled_about(prior.model, positions, pose_sigma, camera, drawn)
     region = answered_voxels(view.frame, view.segment, cube, config.grid)
     opacity = opacity_grids(prior.model, sizeless, positions, pose_sigma, jax.device_put(region), coarse=config.coarse)
     pose = poses(prior.model, sizeless, positions, pose_sigma)
@@ -96,6 +101,34 @@ def published(
         result=posterior.result,
     )
     return _with_error(draft)
+
+
+_Chosen = tuple[Float[Array, "s d"], Float[np.ndarray, "s"], Int[np.ndarray, "s"]]  # positions, weights, populations
+
+
+def _thinned(posterior: Posterior, count: int) -> _Chosen:
+    # NumPy, because the number of samples varies, and nothing may compile for it
+    chosen, weights, population = thin(posterior, count)
+    return jax.device_put(np.asarray(posterior.positions)[chosen]), weights, population
+
+
+def _hedged(kept: _Chosen, draws: Float[Array, "n d"], count: int) -> _Chosen:
+    """The kept shapes and `count` of the network's draws, each shape with the same weight on average.
+
+    The draws' share is that of the pixels which no shape of the sampler explains. Where the prior cannot make what was
+    seen, the sampler's shapes are those that fit least badly, each certain of its own error; the network, which was
+    trained on views like this one, stays unsure. Every population gets as many draws, or one more: its own estimate is
+    hedged as the whole is.
+    """
+    positions, weights, population = kept
+    count = min(count, len(draws))
+    share = count / (count + len(weights))
+    names = np.unique(population)
+    return (
+        jax.device_put(np.concatenate([np.asarray(positions), np.asarray(draws)[:count]])),
+        np.concatenate([(1.0 - share) * weights, np.full(count, share / count)]),
+        np.concatenate([population, names[np.arange(count) % len(names)]]),
+    )
 
 
 def _with_error(h: Hypotheses) -> Hypotheses:

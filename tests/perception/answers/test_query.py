@@ -79,6 +79,19 @@ def test_a_region_is_free_jointly_not_voxel_by_voxel(mug):
     assert both.p_free == 0.0
 
 
+def test_few_hypotheses_support_no_certainty_about_an_unseen_point(mug):
+    """They leave the point at y > 0 free, all of them; nothing is doubtful where it was seen."""
+    points = Points(np.array([[0.0, 0.07, 0.0], [0.0, -0.07, 0.0]]))
+    found = query([mug], points, "object")
+    n = mug.effective_hypotheses
+    assert found.p_occupied == [0.0, 0.0]
+    assert found.p_occupied_few == pytest.approx([1.0 / (n + 2.0), 0.0])
+    one = query([mug], Points(points.points[:1]), "object")
+    assert one.p_occupied_few is not None
+    assert one.p_occupied_few[0] == pytest.approx(1.0 - one.p_free_few)  # as a verdict has it
+    assert query([mug], Box(*LEFT), "object").p_occupied_few is None
+
+
 def test_volumes_are_exact_where_the_box_follows_voxels(mug):
     left = query([mug], Box(*LEFT), "object").volume_m3
     assert left == {"q05": 0.0, "q50": 0.0, "q95": pytest.approx(HANDLE_M3)}
@@ -232,7 +245,7 @@ def test_the_answer_has_the_promised_keys(mug):
     }
     assert query([mug], Box(*LEFT), "object").as_dict().keys() == keys
     points = query([mug], Points(np.zeros((3, 3))), "object").as_dict()
-    assert points.keys() == keys | {"p_occupied"} and points["p_occupied"] == [1.0] * 3
+    assert points.keys() == keys | {"p_occupied", "p_occupied_few"} and points["p_occupied"] == [1.0] * 3
     assert all(isinstance(points[name], float) for name in keys - {"volume_m3", "blocked_by"})
 
 

@@ -70,6 +70,9 @@ def test_the_guess_is_the_first_answer_and_tempering_begins_at_the_network(prior
     assert found.start == "the network's draws" and found.log[0].startswith("64 draws of the network: ESS ")
     assert found.log[0].endswith("-> tempering from there") and found.hypotheses.stage > 0
     assert "network" in found.parts and len(np.unique(found.posterior.population)) == 2
+    draws = round(CONFIG.hypotheses * (1.0 - found.hypotheses.diagnostics.explained))  # the model knows no object
+    assert draws > 0
+    np.testing.assert_allclose(found.hypotheses.weights[-draws:], 1.0 / len(found.hypotheses.weights))
 
 
 def _without_depth(frame: Frame) -> Frame:

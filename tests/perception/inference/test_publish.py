@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from perception.inference.publish import expected_loss
+from perception.inference.publish import _hedged, expected_loss
 from perception.observation.rays import observe
 from perception.observation.segmentation import segment
 from perception.observation.visibility import answered_voxels, seen_voxels
@@ -60,3 +60,16 @@ def test_populations_that_agree_lose_nothing_and_one_cannot_tell() -> None:
     assert expected_loss(cast(Any, _voxel(np.array([0.0, 0.0]))), everywhere) == 0.0
     assert expected_loss(cast(Any, _voxel(np.array([0.0, 1.0]))), everywhere) == pytest.approx(0.5)
     assert np.isnan(expected_loss(cast(Any, _voxel(np.array([0.4]))), everywhere))
+
+
+def test_draws_of_the_network_get_their_share_in_every_population() -> None:
+    positions, population = np.zeros((6, 2)), np.repeat([3, 5], 3)
+    weights, draws = np.array([0.1, 0.1, 0.1, 0.3, 0.2, 0.2]), np.arange(1.0, 17.0).reshape(8, 2)
+    mixed, w, names = _hedged((cast(Any, positions), weights, population), cast(Any, draws), 2)
+    np.testing.assert_array_equal(np.asarray(mixed), np.concatenate([positions, draws[:2]]))
+    assert w.sum() == pytest.approx(1.0)
+    assert w[6:].sum() == pytest.approx(2 / 8)
+    np.testing.assert_allclose(w[:6], 0.75 * weights)
+    np.testing.assert_array_equal(names[6:], [3, 5])
+    few = _hedged((cast(Any, positions), weights, population), cast(Any, draws), 100)[1]
+    assert len(few) == 6 + len(draws)
