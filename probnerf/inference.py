@@ -29,6 +29,12 @@ from probnerf.types import Observation, Posterior
 _log_likelihood = program()(log_likelihood)
 
 
+def suited(config: InferConfig, model: Model) -> InferConfig:
+    """The settings with at least the wall error that the model's preset has."""
+    least = model.preset.wall_sigma if isinstance(model, ProbNeRF) else 0.0
+    return replace(config, wall_sigma=max(config.wall_sigma, least))
+
+
 def likelihood_settings(config: InferConfig, sample_pose: bool = True) -> Likelihood:
     """The likelihood's settings for any view."""
     return Likelihood(

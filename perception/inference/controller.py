@@ -31,6 +31,7 @@ from perception.observation.rays import observe
 from perception.observation.segmentation import Segment
 from perception.observation.visibility import seen_voxels
 from perception.sources.frame import Frame
+from probnerf.inference import suited
 from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.checkpoint import Prior
 from probnerf.sampling.hmc import StageInfo
@@ -98,7 +99,7 @@ def infer_view(
     together. A further run that is cut short is left out.
     """
     begun = time.monotonic()
-    sampler = ViewSampler(view, prior, config.infer, seed, limits, before)
+    sampler = ViewSampler(view, prior, suited(config.infer, prior.model), seed, limits, before)
     publisher = _Publisher(sampler, config, callbacks)
     may_grow = before is None and config.infer.method == "tempered_smc"
     runs: list[Posterior] = []

@@ -38,6 +38,7 @@ class Preset:
     fitted: bool = False  # the field first scales and shifts the points
     smooth: bool = False  # SiLU in the hypernetwork instead of the paper's ReLU
     pairs: int = 2  # of couplings in the flow
+    wall_sigma: float = 0.0  # cube units: the least `InferConfig.wall_sigma` with such a model
 
     @property
     def field(self) -> MLPField:
@@ -71,6 +72,7 @@ PRESETS = {
             fitted=True,
             smooth=True,
             pairs=4,
+            wall_sigma=0.1,
         ),
         Preset("tiny", 4, 8, 2, 1, 16, 16, 8, 16, (4, 4, 4, 4, 4)),  # for tests
     )
