@@ -1,4 +1,7 @@
-"""Answers to one view by the posterior and its quick rivals: the prior alone, the encoder alone, one MAP shape."""
+"""Answers to one view by the posterior and its quick rivals: the prior alone, the encoder alone, one MAP shape.
+
+Of a prior with a posterior network, *encoder alone* is the network alone, and the MAP climbs from its draws.
+"""
 
 import time
 from collections.abc import Collection
@@ -22,6 +25,7 @@ from perception.observation.visibility import answered_voxels
 from perception.sources.frame import Frame
 from probnerf.inference import encoder_guess, likelihood_of
 from probnerf.likelihood.settings import Likelihood
+from probnerf.network_start import network_guess, picture_density
 from probnerf.prior.checkpoint import Prior
 from probnerf.prior.networks import ProbNeRF
 from probnerf.prior.posterior_network import EncoderPicture, guesses
@@ -77,14 +81,31 @@ def answers(
         result[PRIOR] = answer(jax.random.normal(key, (count, dim)), np.full(count, 1.0 / count), begun)
     if ENCODER in methods:
         begun = time.monotonic()
-        drawn, weights = encoder_alone(key, model, likelihood, observation, picture, rivals)
+        if prior.network is not None:
+            drawn = network_draws(key, vessel, prior, observation, cube, config.hypotheses)
+            weights = np.full(len(drawn), 1.0 / len(drawn))
+        else:
+            drawn, weights = encoder_alone(key, model, likelihood, observation, picture, rivals)
         result[ENCODER] = answer(drawn, weights, begun)
     if MAP in methods:
         begun = time.monotonic()
-        starts = guesses(key, model, picture, rivals.yaws, likelihood.sample_pose)
+        if prior.network is not None:
+            starts = network_draws(key, vessel, prior, observation, cube, rivals.yaws)
+        else:
+            starts = guesses(key, model, picture, rivals.yaws, likelihood.sample_pose)
         best, _ = map_estimate(model, likelihood, observation, starts, rivals.fit)
         result[MAP] = answer(best[None], np.ones(1), begun)
     return result
+
+
+def network_draws(
+    key: Array, vessel: VesselView, prior: Prior, observation: Observation, cube: ObjectFrame, count: int
+) -> Float[Array, "count d"]:
+    """Draws of the prior's posterior network."""
+    assert prior.network is not None
+    picture = crop(vessel.frame, vessel.segment, cube, prior.network.sizes.image_size)
+    density = picture_density(prior.network, picture, observation, not vessel.pose_known)
+    return network_guess(key, density, count).positions
 
 
 def encoder_picture(vessel: VesselView, cube: ObjectFrame, prior: Prior) -> EncoderPicture:
