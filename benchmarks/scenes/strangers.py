@@ -8,6 +8,7 @@ point is, solid or free, says the generalised winding number of the mesh (Jacobs
 of a ray's crossings is wrong on meshes of parts that overlap. A scene depends on the mesh and its name alone.
 """
 
+import tempfile
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,9 +23,12 @@ from scipy import ndimage
 from calibration.camera import Camera
 from perception.sources.frame import Frame
 from probnerf.geometry import look_at
+from probnerf.objects.tabletop import VALIDATION_SEEDS
 
 DATA = Path(__file__).resolve().parent.parent.parent.parent / "shared" / "data"
 GSO, BULLET = "scans, to choose by", "Bullet's meshes, test"
+HOUSEHOLD = "the household generator's validation objects"
+SETS = {"gso": GSO, "bullet": BULLET, "household": HOUSEHOLD}
 FILES = {
     GSO: ("val_meshes/gso/*.ply",),
     BULLET: ("meshes/bullet3/mug.obj", "meshes/bullet3/random_objects/*.obj"),
@@ -67,12 +71,27 @@ class Stranger:
     depth: Float[np.ndarray, "h w"]  # the true one, m along z; inf where there is nothing
 
 
-def files(condition: str, data: Path = DATA) -> list[Path]:
-    """The meshes of a condition in order. Raises FileNotFoundError where there is none."""
+def files(condition: str, data: Path = DATA, count: int = 100) -> list[Path]:
+    """The meshes of a condition in order, so many at most. Raises FileNotFoundError where there is none."""
+    if condition == HOUSEHOLD:
+        return household_files(count, Path(tempfile.gettempdir()) / "farside-household")
     found = [path for pattern in FILES[condition] for path in sorted(data.glob(pattern))]
     if not found:
         raise FileNotFoundError(f"{data}: no {FILES[condition][0]} there; give the folder of the data with --data")
-    return found
+    return found[:count]
+
+
+def household_files(count: int, folder: Path) -> list[Path]:
+    """Meshes of so many of the generator's validation objects, written into a folder."""
+    from probnerf.objects.household import draw_mesh  # it needs the extra `meshes`
+
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for seed in VALIDATION_SEEDS[:count]:
+        made = draw_mesh(seed)
+        paths.append(folder / f"{made.name.replace(' ', '_')}_{seed}.ply")
+        made.mesh.export(paths[-1])
+    return paths
 
 
 def stranger(path: Path, config: StrangerConfig | None = None) -> Stranger:

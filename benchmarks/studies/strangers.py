@@ -19,7 +19,8 @@ scores 0.693.
   of each one's own error, which is larger, as points of one object err together.
 - free: share of points with p <= 0.05. free_occupied: share of these that are occupied. Every object has the same
   weight, whatever the number of its points.
-- out_of_model: share of objects that are flagged.
+- out_of_model: share of objects that are flagged. explained_q05: the share of its pixels that the shapes explain of
+  all but the worst 5% of the objects.
 - outside: share of the occupied points that lie outside the cube in which perception looks for the object, where an
   answer is always "free".
 - refused: objects that perception does not take. They have no answer, and no part in any mean.
@@ -45,7 +46,7 @@ from benchmarks.harness.study import PriorOptions, Summary, results_of, resumed
 from benchmarks.harness.tables import Table, gated, ranged
 from benchmarks.measures.point_scores import point_scores, pooled_ece
 from benchmarks.rivals.hilbert_map import HilbertMapConfig, hilbert_map
-from benchmarks.scenes.strangers import BULLET, DATA, GSO, StrangerConfig, files, hidden_points, stranger
+from benchmarks.scenes.strangers import DATA, SETS, StrangerConfig, files, hidden_points, stranger
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.query import query
 from perception.answers.regions import Points
@@ -58,7 +59,6 @@ from probnerf.prior.checkpoint import Prior, load_prior
 ALONE, QUERIED, RIVAL = ALWAYS = ("tempered_smc", "tempered_smc, as queried", "hilbert_map")
 FIRST = "first answer"
 METHODS = (*ALWAYS, FIRST)
-SETS = {"gso": GSO, "bullet": BULLET}
 DONT_KNOW = float(np.log(2.0))  # nats; what one half everywhere scores
 BEFORE = "before"  # the method's name in rows of an older file
 AIMS = {"balanced": 0.5, "ece": 0.08, "free_occupied": 0.05, "free": 0.15, "out_of_model": 0.20}
@@ -69,8 +69,9 @@ SCORES = ("log_score", "balanced", "ece")
 class Options(PriorOptions):
     """Things that no one trained on: the space behind what was seen, beside a map without shapes."""
 
-    set: Literal["gso", "bullet", "both"] = "gso"
-    """Scans, to choose by; Bullet's meshes, for the test alone; or both."""
+    set: Literal["gso", "bullet", "both", "household"] = "gso"
+    """Scans, to choose by; Bullet's meshes, for the test alone; both; or the household generator's validation objects,
+    which are no strangers to a prior that learnt it."""
     n: int = 100
     """Objects of each set at most."""
     stages: int = 60
@@ -104,9 +105,9 @@ def _measure(options: Options, prior: Prior, results: Results) -> None:
     settings = {ALONE: ours, QUERIED: ours, RIVAL: rival}
     if prior.network is not None:
         settings[FIRST] = ours
-    names = list(SETS) if options.set == "both" else [options.set]
+    names = ["gso", "bullet"] if options.set == "both" else [options.set]
     for name in names:
-        for path in files(SETS[name], options.data)[: options.n]:
+        for path in files(SETS[name], options.data, options.n):
             common = {"prior": prior.identity, "condition": SETS[name], "object": path.stem, "seed": options.seed}
             lines = {method: {**common, "method": method, "settings": own} for method, own in settings.items()}
             if all(line in results for line in lines.values()):
@@ -239,6 +240,8 @@ def _method_rows(method: str, condition: str, own: list[Line]) -> list[Row]:
         "free_occupied": float(wrong.sum() / called.sum()) if called.any() else 0.0,
     }
     values |= {k: float(np.nanmean(_values(own, k))) for k in ("out_of_model", "outside", "seconds") if k in own[0]}
+    if "explained" in own[0]:
+        values["explained_q05"] = float(np.quantile(_values(own, "explained"), 0.05))
     rows = [Row("strangers", method, condition, k, v, "s" * (k == "seconds"), len(own)) for k, v in values.items()]
     for metric in ("log_score", "balanced"):
         rows += mean_rows("strangers", method, condition, metric, _values(own, metric), "nats")
@@ -322,7 +325,7 @@ def _draw(lines: Sequence[Line]) -> Figure:
     figure = Figure(figsize=(6, 6), layout="constrained")
     ax = figure.subplots()
     most = 1.0
-    for condition, colour in zip(SETS.values(), ("tab:blue", "tab:red"), strict=True):
+    for condition, colour in zip(SETS.values(), ("tab:blue", "tab:red", "tab:green"), strict=True):
         ours, rival = (_by_object(lines, method, condition) for method in (ALONE, RIVAL))
         if names := [name for name in ours if name in rival]:
             a, b = (_values([own[name] for name in names], "balanced") for own in (rival, ours))

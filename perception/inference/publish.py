@@ -17,6 +17,7 @@ from perception.sources.frame import Frame
 from probnerf.inference import without_sizes
 from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.checkpoint import Prior
+from probnerf.prior.networks import ProbNeRF
 from probnerf.sampling.populations import thin
 from probnerf.shapes import explained, opacity_grids, poses, scaled_about
 from probnerf.types import Observation, Posterior
@@ -80,7 +81,7 @@ def published(
         population=population,
         seen=view.seen,
         inside_view=_inside_picture(view.segment),
-        out_of_model=fit < config.out_of_model_below,
+        out_of_model=fit < _flagged_below(prior, config),
         stage=int(d.stages),
         monte_carlo_error=0.0,
         prior_hash=prior.identity,
@@ -103,6 +104,11 @@ def published(
         result=posterior.result,
     )
     return _with_error(draft)
+
+
+def _flagged_below(prior: Prior, config: PublishConfig) -> float:
+    model = prior.model
+    return min(config.out_of_model_below, model.preset.explains if isinstance(model, ProbNeRF) else 1.0)
 
 
 _Chosen = tuple[Float[Array, "s d"], Float[np.ndarray, "s"], Int[np.ndarray, "s"]]  # positions, weights, populations

@@ -14,9 +14,11 @@ from benchmarks.scenes.strangers import (
     StrangerConfig,
     files,
     hidden_points,
+    household_files,
     solid_at,
     stranger,
 )
+from probnerf.objects.tabletop import VALIDATION_SEEDS
 
 SIDES = np.array([0.08, 0.12, 0.2])
 SMALL = StrangerConfig(width=320, height=240, focal=300.0)
@@ -106,3 +108,9 @@ def test_files_without_triangles_and_missing_data_are_named(tmp_path: Path) -> N
 
 def test_the_sets_are_whole(shared_data: Path) -> None:
     assert {condition: len(files(condition)) for condition in FILES} == {GSO: 27, BULLET: 61}
+
+
+def test_the_generators_validation_objects_are_written_to_be_read_as_any_mesh(tmp_path: Path) -> None:
+    paths = household_files(2, tmp_path / "here")
+    assert all(trimesh.load_mesh(path).is_watertight or len(trimesh.load_mesh(path).faces) for path in paths)
+    assert [path.stem.rsplit("_", 1)[1] for path in paths] == [str(seed) for seed in VALIDATION_SEEDS[:2]]

@@ -10,13 +10,12 @@ import trimesh
 from benchmarks.harness.intervals import Figures
 from benchmarks.harness.results import Results
 from benchmarks.measures.point_scores import point_scores
+from benchmarks.scenes.strangers import BULLET, GSO
 from benchmarks.studies.strangers import (
     ALONE,
     ALWAYS,
     BEFORE,
-    BULLET,
     FIRST,
-    GSO,
     METHODS,
     QUERIED,
     RIVAL,
