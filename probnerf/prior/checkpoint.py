@@ -21,7 +21,7 @@ M = TypeVar("M")
 FORMAT = "farside-prior-1"
 NETWORK_FORMAT = "farside-posterior-network-1"
 RECOGNITION_FORMAT = "farside-recognition-1"
-SHIPPED = Path(__file__).parent / "weights" / "tabletop.safetensors"
+SHIPPED = Path(__file__).parent / "weights" / "household.safetensors"
 
 
 @dataclass(frozen=True)

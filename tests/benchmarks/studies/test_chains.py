@@ -47,7 +47,7 @@ def test_a_chain_counts_by_its_own_samples_and_their_weights(monkeypatch: pytest
 
 def test_the_file_is_summed_up(tmp_path: Path) -> None:
     """A stuck chain and draws that agree show in the rows."""
-    prior, config = load_prior().hash, ControllerConfig()
+    prior, config = load_prior().identity, ControllerConfig()
     told = zip(COMPARED, ([0.02, 0.02], [0.02, 0.04], [0.02, 0.6], [0.02]), (0.3, 0.3, 0.5, 0.1), strict=True)
     results = Results(tmp_path / "chains.jsonl")
     for method, missed, spread in told:

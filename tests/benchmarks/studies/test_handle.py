@@ -17,6 +17,7 @@ from probnerf.objects.tabletop import TEST_SEEDS, TRAIN_SEEDS, signed_distance
 from probnerf.objects.tabletop_sampler import MUG, PITCHER
 from probnerf.prior.checkpoint import load_prior
 from probnerf.rendering.occupancy import voxel_centres
+from tests.priors import TABLETOP
 
 
 def test_of_the_family_s_shapes_those_with_a_handle_are_told_from_those_without() -> None:
@@ -40,7 +41,7 @@ def test_a_can_with_a_block_beside_it_has_one_only_at_plus_x() -> None:
 
 def test_the_prior_s_shapes_have_handles_as_often_as_the_family() -> None:
     """And seldom something between: the threshold decides next to nothing."""
-    model = load_prior().model
+    model = load_prior(TABLETOP).model
     drawn = jax.random.normal(jax.random.key(1), (300, model.latent))
     share = np.mean([bool(PlacedObject(seed, 0.0, 0.0, 0.0).shape.has_handle) for seed in TRAIN_SEEDS[:300]])
     assert has_handle(model, drawn).mean() == pytest.approx(share, abs=0.08)

@@ -5,6 +5,7 @@ import pytest
 
 from benchmarks.studies.kinds import ALL, METHOD, Options, main, source_rows, summary
 from probnerf.types import KINDS
+from tests.priors import TABLETOP
 
 RNG = np.random.default_rng(0)
 
@@ -47,4 +48,4 @@ def test_the_gate_is_judged_on_all_objects_together() -> None:
 
 def test_a_prior_without_a_network_is_refused() -> None:
     with pytest.raises(ValueError, match="no posterior network"):
-        main(Options(n=1, quick=True))
+        main(Options(n=1, quick=True, prior=TABLETOP))

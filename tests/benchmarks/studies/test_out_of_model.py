@@ -66,7 +66,7 @@ def test_answers_that_are_there_are_not_made_again(box: Path, tmp_path: Path) ->
     kept = Results(tmp_path / "kept.jsonl")
     with pytest.raises(ValueError, match="no mesh"):
         main(Options(tmp_path, n=1, meshes=tmp_path, results=kept.path))
-    same = {"prior": load_prior().hash, "method": "tempered_smc", "settings": {}, "seed": 0}
+    same = {"prior": load_prior().identity, "method": "tempered_smc", "settings": {}, "seed": 0}
     for condition in CONDITIONS:
         for number, fit in enumerate((0.9, 0.95) if condition == FAMILY else (0.5, 0.93)):
             told = {"explained": fit, "evidence": fit, "flagged": fit < 0.8, "hidden_nll_queried": 0.2}

@@ -13,7 +13,6 @@ from benchmarks.measures.point_scores import point_scores
 from benchmarks.scenes.strangers import BULLET, GSO
 from benchmarks.studies.strangers import (
     ALONE,
-    ALWAYS,
     BEFORE,
     FIRST,
     METHODS,
@@ -81,9 +80,9 @@ def test_an_object_goes_from_mesh_to_rows_once(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no results"):
         main(options)
     kept = {each["method"]: each for each in Results(options.results).lines}
-    assert set(kept) == set(ALWAYS) and kept[ALONE]["condition"] == BULLET
+    assert set(kept) == set(METHODS) and kept[ALONE]["condition"] == BULLET
     assert "2 cm high" in kept[ALONE]["refused"] and 0.0 < kept[RIVAL]["balanced"] < 2.0
-    assert kept[ALONE]["prior"] == load_prior().hash
+    assert kept[ALONE]["prior"] == load_prior().identity
     size = options.results.stat().st_size
     with pytest.raises(ValueError, match="no results"):
         main(replace(options, n=1))
@@ -94,5 +93,5 @@ def test_an_object_goes_from_mesh_to_rows_once(tmp_path: Path) -> None:
 def test_a_scan_is_answered_with_and_without_caution(shared_data: Path, tmp_path: Path) -> None:
     found = main(Options(tmp_path, n=2, stages=10, results=tmp_path / "rows.jsonl", data=shared_data))
     of = Figures(found.rows)
-    assert of.methods(GSO) == list(ALWAYS) and of.count(GSO, ALONE, "balanced") == 2
-    assert all(0.0 < of(GSO, method, "balanced") < 2.0 for method in ALWAYS)
+    assert of.methods(GSO) == list(METHODS) and of.count(GSO, ALONE, "balanced") == 2
+    assert all(0.0 < of(GSO, method, "balanced") < 2.0 for method in METHODS)
