@@ -64,9 +64,7 @@ class ReplayConfig:
     """Colour image of a recording that has several."""
     depth_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
     """Depth image of a recording; needed where its name does not say depth, or its frame_id is not colour's."""
-    prior: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the shipped one)")] = (
-        None
-    )
+    prior: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the shipped one)")] = None
     """Weights of another prior (.safetensors, as `farside train` writes them)."""
     colour_only: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Ignore depth. The camera's height and tilt are then needed: see `segment` in launch/replay.yaml."""
@@ -133,9 +131,7 @@ class LiveConfig:
     """Stop after this time."""
     seed: Annotated[int, arg(metavar="N")] = 0
     """Seed of everything random."""
-    prior: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the shipped one)")] = (
-        None
-    )
+    prior: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the shipped one)")] = None
     """Weights of another prior."""
     bus: BusConfig = field(default_factory=lambda: BusConfig(listen=(ENDPOINT,)))
     topic: TopicConfig = field(default_factory=TopicConfig)
