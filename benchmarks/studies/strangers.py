@@ -45,12 +45,12 @@ from benchmarks.harness.rows import Row
 from benchmarks.harness.study import PriorOptions, Summary, results_of, resumed
 from benchmarks.harness.tables import Table, gated, ranged
 from benchmarks.measures.point_scores import point_scores, pooled_ece
-from benchmarks.rivals.hilbert_map import HilbertMapConfig, hilbert_map
 from benchmarks.scenes.strangers import DATA, SETS, StrangerConfig, files, hidden_points, stranger
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.query import query
 from perception.answers.regions import Points
 from perception.inference.controller import estimate
+from perception.inference.hilbert_map import HilbertMapConfig, hilbert_map
 from perception.inference.settings import ControllerConfig
 from perception.observation.segmentation import Segment, segment
 from perception.sources.frame import Frame

@@ -1,6 +1,7 @@
 """From a posterior's samples to Hypotheses."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
+from perception.inference.hilbert_map import HilbertMap, hilbert_map
 from perception.inference.settings import PublishConfig
 from perception.observation.object_frame import ObjectFrame
 from perception.observation.segmentation import Segment
@@ -22,7 +24,9 @@ from probnerf.sampling.populations import thin
 from probnerf.shapes import explained, opacity_grids, poses, scaled_about
 from probnerf.types import Observation, Posterior
 
-HEDGE = 2.0  # chosen by the scans' scores (`farside bench strangers`): 1 to 4 are as good within 0.01 nats
+# chosen by the scans' scores (`farside bench strangers`)
+HEDGE = 2.0  # 1 to 4 are as good within 0.01 nats
+SMOOTH_ABOVE = 0.1  # share of pixels not explained
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +40,11 @@ class ConditionedView:
     seen: Bool[np.ndarray, "g g g"]  # by any frame
     pose_known: bool = False  # `object_frame` is the object's own cube (the handle at +x): only the shape is inferred
 
+    @cached_property
+    def smooth_map(self) -> HilbertMap:
+        """What the frame's depth says without knowing shapes."""
+        return hilbert_map(self.frame, self.segment)
+
 
 def published(
     view: ConditionedView,
@@ -48,16 +57,23 @@ def published(
     evidence_power: float = float("nan"),
     guess: Posterior | None = None,
 ) -> Hypotheses:
-    """The posterior as Hypotheses, with draws of `guess` among them where pixels stay unexplained (`_hedged`).
+    """The posterior as Hypotheses. With a network's `guess`, where pixels stay unexplained, draws of it are among them
+    (`_hedged`), and shapes of a smooth map (`_beside_smooth`).
 
     `point_gradients` and `evidence_power` become diagnostics of it.
     """
     positions, weights, population = _thinned(posterior, config.hypotheses)
     sizeless, pose_sigma = without_sizes(likelihood), view.observation.pose_sigma
     fit = float(weights @ np.asarray(explained(prior.model, sizeless, view.observation, positions), np.float64))
-    if guess is not None and (draws := round(config.hypotheses * min(1.0, HEDGE * (1.0 - fit)))):
-        kept = _thinned(posterior, config.hypotheses - draws)
-        positions, weights, population = _hedged(kept, guess.positions, draws)
+    smooth = 0
+    if guess is not None:
+        if view.frame.depth is not None and 1.0 - fit > SMOOTH_ABOVE:
+            smooth = round((config.hypotheses - 1) * (1.0 - fit))
+        learnt = config.hypotheses - smooth
+        if draws := min(learnt - 1, round(learnt * HEDGE * (1.0 - fit))):
+            positions, weights, population = _hedged(_thinned(posterior, learnt - draws), guess.positions, draws)
+        elif smooth:
+            positions, weights, population = _thinned(posterior, learnt)
     cube = view.object_frame
     if cube.sight_sigma > 0.0:  # no pixel informs it, so it is not sampled: each sample draws it from its prior
         key = jax.random.fold_in(jax.random.key(seed), 1)
@@ -103,7 +119,7 @@ def published(
         ),
         result=posterior.result,
     )
-    return _with_error(draft)
+    return _with_error(_beside_smooth(draft, view.smooth_map, smooth) if smooth else draft)
 
 
 def _flagged_below(prior: Prior, config: PublishConfig) -> float:
@@ -136,6 +152,25 @@ def _hedged(kept: _Chosen, draws: Float[Array, "n d"], count: int) -> _Chosen:
         jax.device_put(np.concatenate([np.asarray(positions), np.asarray(draws)[:count]])),
         np.concatenate([(1.0 - share) * weights, np.full(count, share / count)]),
         np.concatenate([population, names[np.arange(count) % len(names)]]),
+    )
+
+
+def _beside_smooth(h: Hypotheses, smooth: HilbertMap, count: int) -> Hypotheses:
+    """With so many shapes drawn from the map, each with the same weight as the others on average.
+
+    Their share is that of the pixels which no shape of the sampler explains. What the prior cannot make is guessed
+    better by a map that knows no shapes; but where none of the learnt shapes reaches, these end: the map knows of
+    nothing behind what was seen, and calls space free only before it.
+    """
+    made = smooth.shapes(h.object_frame, h.grid, count, h.seed) & h.solid[h.weights > 0.0].any(axis=0)
+    share = count / (count + len(h.weights))
+    names = np.unique(h.population)
+    return replace(
+        h,
+        opacity=np.concatenate([h.opacity, np.where(made, np.uint8(255), np.uint8(0))]),
+        pose=np.concatenate([h.pose, np.zeros((count, h.pose.shape[1]), h.pose.dtype)]),
+        weights=np.concatenate([(1.0 - share) * h.weights, np.full(count, share / count)]),
+        population=np.concatenate([h.population, names[np.arange(count) % len(names)]]),
     )
 
 

@@ -6,11 +6,12 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from perception.inference.publish import _hedged, expected_loss
+from perception.inference.publish import _beside_smooth, _hedged, expected_loss
 from perception.observation.rays import observe
 from perception.observation.segmentation import segment
 from perception.observation.visibility import answered_voxels, seen_voxels
 from probnerf.rendering.occupancy import voxel_centres
+from tests.node.mugs import mug_hypotheses, table_frame
 from tests.perception.cylinders import CAN, looking_down, picture
 
 
@@ -73,3 +74,16 @@ def test_draws_of_the_network_get_their_share_in_every_population() -> None:
     np.testing.assert_array_equal(names[6:], [3, 5])
     few = _hedged((cast(Any, positions), weights, population), cast(Any, draws), 100)[1]
     assert len(few) == 6 + len(draws)
+
+
+def test_smooth_shapes_get_their_share_and_end_where_no_learnt_shape_reaches() -> None:
+    frame = table_frame()
+    mug = mug_hypotheses(frame, segment(frame)[0], [0.5, 2.0, 3.0], [0.5, 0.3, 0.2])
+    everything = SimpleNamespace(shapes=lambda cube, grid, count, seed: np.ones((count, grid, grid, grid), bool))
+    mixed = _beside_smooth(mug, cast(Any, everything), 4)
+    learnt = mug.solid.any(axis=0)
+    n = len(mug.weights)
+    assert mixed.weights[n:].sum() == pytest.approx(4 / (n + 4))
+    np.testing.assert_allclose(mixed.weights[:n], n / (n + 4) * mug.weights)
+    assert set(mixed.population) == set(mug.population)
+    assert (mixed.solid[n:] | learnt == learnt).all() and (mixed.solid[n:].mean() > 0.9 * learnt.mean())

@@ -6,9 +6,11 @@ import trimesh
 from scipy.special import expit
 from scipy.stats import norm
 
-from benchmarks.rivals.hilbert_map import HilbertMap, HilbertMapConfig, features, fit, hilbert_map, thinned
 from benchmarks.scenes.strangers import StrangerConfig, hidden_points, stranger
+from perception.inference.hilbert_map import HilbertMap, HilbertMapConfig, features, fit, hilbert_map, thinned
+from perception.observation.object_frame import ObjectFrame
 from perception.observation.segmentation import segment
+from probnerf.rendering.occupancy import voxel_centres
 
 CONFIG = HilbertMapConfig()
 GRID = np.stack(np.meshgrid(*[np.arange(-0.15, 0.16, 0.05)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -47,6 +49,20 @@ def test_predictions_are_the_mean_of_the_posterior() -> None:
     u = norm.ppf((np.arange(2000) + 0.5) / 2000)
     exact = expit(phi @ given.mean + u[:, None] * spread).mean(axis=0)
     np.testing.assert_allclose(given.p_occupied(asked), exact, atol=0.02)
+
+
+def test_drawn_shapes_are_solid_as_often_as_predicted() -> None:
+    found = fit(POINTS[::8], POINTS[::8, 0] < 0.02, GRID, CONFIG)
+    turn = np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0]
+    turn[:, 0] *= np.linalg.det(turn)
+    T = np.eye(4)
+    T[:3] = np.column_stack([turn, [0.01, -0.02, 0.03]])
+    cube = ObjectFrame(T, 0.15, np.array([0.0, 0.0, 1.0, 0.0]), 0.1, 0.1)
+    drawn = found.shapes(cube, 8, 2000, seed=0)
+    centres = voxel_centres(8).reshape(-1, 3) * 0.15 @ turn.T + T[:3, 3]
+    p = found.p_occupied(centres)
+    assert np.ptp(p) > 0.5
+    np.testing.assert_allclose(drawn.reshape(2000, -1).mean(axis=0), p, atol=0.06)
 
 
 def test_a_cell_keeps_the_mean_of_its_points() -> None:

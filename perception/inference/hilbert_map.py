@@ -13,15 +13,19 @@ A point's features are phi_i(x) = exp(-gamma |x - h_i|^2) of the hinge points h_
 V-PRISM has a class a thing, with weights of their own and a softmax. With one object beside the background that is the
 logistic regression p(y = 1 | x, w) = sigmoid(w . phi(x)) of the difference of the two classes' weights, whose prior
 variance is twice theirs; and EM then ascends the bound of Jaakkola and Jordan (2000).
+
+Whole shapes are drawn from it (`HilbertMap.shapes`; theirs are points alone): where the prior's shapes do not explain a
+view, they stand beside them (`perception.inference.publish`).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.linalg import cho_factor, cho_solve
-from scipy.special import expit
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.special import expit, logit
 
+from perception.observation.object_frame import ObjectFrame
 from perception.observation.segmentation import Segment, backproject
 from perception.observation.support_plane import heights
 from perception.sources.frame import Frame
@@ -59,6 +63,26 @@ class HilbertMap:
         phi = features(points, self.hinges, self.gamma)
         variance = np.einsum("nm,mn->n", phi, cho_solve(cho_factor(self.precision), phi.T))
         return expit(phi @ self.mean / np.sqrt(1.0 + np.pi / 8.0 * variance))
+
+    def shapes(self, cube: ObjectFrame, grid: int, count: int, seed: int) -> Bool[np.ndarray, "count grid grid grid"]:
+        """Drawn solids {x : w . phi(x) > logit u}, w of the posterior and u uniform, on the voxels of a cube in the
+        map's frame. Over them, P(solid at x) = E[sigmoid(w . phi(x))]. The u are stratified.
+        """
+        rng = np.random.default_rng([seed, 73])
+        lower, _ = cho_factor(self.precision, lower=True)
+        noise = rng.standard_normal((len(self.mean), count))
+        weights = (self.mean[:, None] + solve_triangular(lower, noise, lower=True, trans="T")).T.astype(np.float32)
+        least = logit((rng.permutation(count) + rng.random(count)) / count)
+        # a Gaussian about a hinge point is the product of one along each axis of the cube
+        axis = -1.0 + (np.arange(grid) + 0.5) * 2.0 / grid
+        square = np.square(axis - cube.to_cube(self.hinges)[..., None])  # of each hinge, axis and voxel
+        along = np.exp(-self.gamma * cube.half_extent**2 * square).astype(np.float32)
+        faces = np.einsum("mj,mk->mjk", along[:, 1], along[:, 2]).reshape(len(along), -1)
+        made = np.empty((count, grid, grid, grid), bool)
+        for shape, w, level in zip(made, weights, least, strict=True):
+            value = (along[:, 0] * w[:-1, None]).T @ faces + w[-1]
+            shape[...] = (value > level).reshape(shape.shape)
+        return made
 
 
 def features(
