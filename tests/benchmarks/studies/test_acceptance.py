@@ -19,6 +19,7 @@ from benchmarks.studies.acceptance import (
 )
 from probnerf.prior.checkpoint import load_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
+from tests.priors import TABLETOP
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +55,7 @@ def test_quadrature_conserves_light_and_nears_its_limit(seen) -> None:
 
 @pytest.mark.slow
 def test_acceptance_falls_with_the_step_for_every_renderer() -> None:
-    model = load_prior(None).model
+    model = load_prior(TABLETOP).model
     z_tilde, rays = jax.random.normal(jax.random.key(5), (model.latent,)), view_rays(5, 48)
     for name in RENDERERS:
         small, middle, large = (

@@ -17,6 +17,7 @@ from perception.sources.settings import SHIPPED_LOG
 from probnerf.prior.checkpoint import load_prior
 from probnerf.settings import InferConfig, quick_smc
 from tests.perception.inference.test_tracker import frame_from
+from tests.priors import TABLETOP
 
 CONFIG = ControllerConfig(
     # no climbs, which cost the same however many runs
@@ -31,7 +32,7 @@ CONFIG = ControllerConfig(
 def answers_of(config: ControllerConfig, stages: int | None = None) -> tuple[Estimate, list[Hypotheses]]:
     frame, answers = frame_from(0.0), list[Hypotheses]()
     found = estimate(
-        frame, segment(frame)[0], load_prior(), config, seed=3, stages=stages, on_answer=answers.append
+        frame, segment(frame)[0], load_prior(TABLETOP), config, seed=3, stages=stages, on_answer=answers.append
     )  # fmt: skip
     return found, answers
 
@@ -100,7 +101,7 @@ def test_two_threads_ask_at_once_and_both_are_answered() -> None:
     """From modes and from the prior at once: on two cores the library of eigenvalues would wait for ever, each for the
     thread that the other holds.
     """
-    frame, prior = next(iter(Log(SHIPPED_LOG))), load_prior()
+    frame, prior = next(iter(Log(SHIPPED_LOG))), load_prior(TABLETOP)
     hidden = segment(frame)[0]
     both = (_alone(hidden), hidden)
 
