@@ -62,18 +62,20 @@ def published(
 
     `point_gradients` and `evidence_power` become diagnostics of it.
     """
-    positions, weights, population = _thinned(posterior, config.hypotheses)
+    chosen = _thinned(posterior, config.hypotheses)
     sizeless, pose_sigma = without_sizes(likelihood), view.observation.pose_sigma
-    fit = float(weights @ np.asarray(explained(prior.model, sizeless, view.observation, positions), np.float64))
+    each = explained(prior.model, sizeless, view.observation, _padded(chosen[0], config.hypotheses))
+    fit = float(chosen[1] @ np.asarray(each, np.float64)[: len(chosen[1])])
     smooth = 0
-    if guess is not None:
+    if guess is not None and fit < 1.0:
+        room = max(config.hypotheses - len(np.unique(chosen[2])), 0)  # every population keeps a shape of its own
         if view.frame.depth is not None and 1.0 - fit > SMOOTH_ABOVE:
-            smooth = round((config.hypotheses - 1) * (1.0 - fit))
+            smooth = min(round(config.hypotheses * (1.0 - fit)), room // 2)
         learnt = config.hypotheses - smooth
-        if draws := min(learnt - 1, round(learnt * HEDGE * (1.0 - fit))):
-            positions, weights, population = _hedged(_thinned(posterior, learnt - draws), guess.positions, draws)
-        elif smooth:
-            positions, weights, population = _thinned(posterior, learnt)
+        share = min(HEDGE * (1.0 - fit), 1.0 - 1.0 / learnt)
+        draws = min(round(learnt * share), room - smooth)
+        chosen = _hedged(_thinned(posterior, learnt - draws), guess.positions, draws, share)
+    positions, weights, population = chosen
     cube = view.object_frame
     if cube.sight_sigma > 0.0:  # no pixel informs it, so it is not sampled: each sample draws it from its prior
         key = jax.random.fold_in(jax.random.key(seed), 1)
@@ -81,8 +83,9 @@ def published(
         camera = jnp.asarray(cube.to_cube(np.zeros(3)), jnp.float32)
         positions = scaled_about(prior.model, positions, pose_sigma, camera, drawn)
     region = answered_voxels(view.frame, view.segment, cube, config.grid)
-    opacity = opacity_grids(prior.model, sizeless, positions, pose_sigma, jax.device_put(region), coarse=config.coarse)
-    pose = poses(prior.model, sizeless, positions, pose_sigma)
+    padded, count = _padded(positions, config.hypotheses), len(weights)
+    opacity = opacity_grids(prior.model, sizeless, padded, pose_sigma, jax.device_put(region), coarse=config.coarse)
+    pose = poses(prior.model, sizeless, padded, pose_sigma)
     d = posterior.diagnostics
     draft = Hypotheses(
         stamp_ns=view.frame.stamp_ns,
@@ -91,8 +94,8 @@ def published(
         label="",
         object_frame=view.object_frame,
         T_world_camera=view.frame.T_world_camera,
-        opacity=np.asarray(opacity),
-        pose=np.stack([np.asarray(a) for a in (pose.yaw, pose.x, pose.y, pose.log_scale, pose.z)], axis=-1),
+        opacity=np.asarray(opacity)[:count],
+        pose=np.stack([np.asarray(a)[:count] for a in (pose.yaw, pose.x, pose.y, pose.log_scale, pose.z)], axis=-1),
         weights=weights,
         population=population,
         seen=view.seen,
@@ -119,7 +122,7 @@ def published(
         ),
         result=posterior.result,
     )
-    return _with_error(_beside_smooth(draft, view.smooth_map, smooth) if smooth else draft)
+    return _with_error(_beside_smooth(draft, view.smooth_map, smooth, 1.0 - fit) if smooth else draft)
 
 
 def _flagged_below(prior: Prior, config: PublishConfig) -> float:
@@ -136,42 +139,55 @@ def _thinned(posterior: Posterior, count: int) -> _Chosen:
     return jax.device_put(np.asarray(posterior.positions)[chosen]), weights, population
 
 
-def _hedged(kept: _Chosen, draws: Float[Array, "n d"], count: int) -> _Chosen:
-    """The kept shapes and `count` of the network's draws, each shape with the same weight on average.
+def _padded(positions: Float[Array, "s d"], count: int) -> Float[Array, "p d"]:
+    """At least `count` of them, the last one repeated: programs are compiled for that many, once."""
+    missing = max(count - len(positions), 0)
+    return jax.device_put(np.pad(np.asarray(positions), ((0, missing), (0, 0)), mode="edge")) if missing else positions
 
-    The draws' share is `HEDGE` times that of the pixels which no shape of the sampler explains. Where the prior cannot
+
+def _hedged(kept: _Chosen, draws: Float[Array, "n d"], count: int, share: float) -> _Chosen:
+    """The kept shapes and `count` of the network's draws, which take a share of the weight.
+
+    Their share is `HEDGE` times that of the pixels which no shape of the sampler explains. Where the prior cannot
     make what was seen, the sampler's shapes are those that fit least badly, each certain of its own error; the network,
     which was trained on views like this one, stays unsure. Every population gets as many draws, or one more: its own
     estimate is hedged as the whole is.
     """
     positions, weights, population = kept
     count = min(count, len(draws))
-    share = count / (count + len(weights))
-    names = np.unique(population)
+    if not count:
+        return kept
     return (
         jax.device_put(np.concatenate([np.asarray(positions), np.asarray(draws)[:count]])),
-        np.concatenate([(1.0 - share) * weights, np.full(count, share / count)]),
-        np.concatenate([population, names[np.arange(count) % len(names)]]),
+        *_mixed(weights, population, count, share),
     )
 
 
-def _beside_smooth(h: Hypotheses, smooth: HilbertMap, count: int) -> Hypotheses:
-    """With so many shapes drawn from the map, each with the same weight as the others on average.
+def _beside_smooth(h: Hypotheses, smooth: HilbertMap, count: int, share: float) -> Hypotheses:
+    """With so many shapes drawn from the map, which take a share of the weight: that of the pixels which no shape of
+    the sampler explains.
 
-    Their share is that of the pixels which no shape of the sampler explains. What the prior cannot make is guessed
-    better by a map that knows no shapes; but where none of the learnt shapes reaches, these end: the map knows of
-    nothing behind what was seen, and calls space free only before it.
+    What the prior cannot make is guessed better by a map that knows no shapes; but where none of the learnt shapes
+    reaches, these end: the map knows of nothing behind what was seen, and calls space free only before it.
     """
     made = smooth.shapes(h.object_frame, h.grid, count, h.seed) & h.solid[h.weights > 0.0].any(axis=0)
-    share = count / (count + len(h.weights))
-    names = np.unique(h.population)
+    weights, population = _mixed(h.weights, h.population, count, share)
     return replace(
         h,
         opacity=np.concatenate([h.opacity, np.where(made, np.uint8(255), np.uint8(0))]),
         pose=np.concatenate([h.pose, np.zeros((count, h.pose.shape[1]), h.pose.dtype)]),
-        weights=np.concatenate([(1.0 - share) * h.weights, np.full(count, share / count)]),
-        population=np.concatenate([h.population, names[np.arange(count) % len(names)]]),
+        weights=weights,
+        population=population,
     )
+
+
+def _mixed(
+    weights: Float[np.ndarray, "s"], population: Int[np.ndarray, "s"], count: int, share: float
+) -> tuple[Float[np.ndarray, "s+count"], Int[np.ndarray, "s+count"]]:
+    """Weights and populations with `count` more shapes, dealt to the populations in turn."""
+    names = np.unique(population)
+    dealt = names[np.arange(count) % len(names)]
+    return np.concatenate([(1.0 - share) * weights, np.full(count, share / count)]), np.concatenate([population, dealt])
 
 
 def _with_error(h: Hypotheses) -> Hypotheses:

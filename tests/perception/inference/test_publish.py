@@ -66,13 +66,13 @@ def test_populations_that_agree_lose_nothing_and_one_cannot_tell() -> None:
 def test_draws_of_the_network_get_their_share_in_every_population() -> None:
     positions, population = np.zeros((6, 2)), np.repeat([3, 5], 3)
     weights, draws = np.array([0.1, 0.1, 0.1, 0.3, 0.2, 0.2]), np.arange(1.0, 17.0).reshape(8, 2)
-    mixed, w, names = _hedged((cast(Any, positions), weights, population), cast(Any, draws), 2)
+    mixed, w, names = _hedged((cast(Any, positions), weights, population), cast(Any, draws), 2, 0.4)
     np.testing.assert_array_equal(np.asarray(mixed), np.concatenate([positions, draws[:2]]))
     assert w.sum() == pytest.approx(1.0)
-    assert w[6:].sum() == pytest.approx(2 / 8)
-    np.testing.assert_allclose(w[:6], 0.75 * weights)
+    assert w[6:].sum() == pytest.approx(0.4)
+    np.testing.assert_allclose(w[:6], 0.6 * weights)
     np.testing.assert_array_equal(names[6:], [3, 5])
-    few = _hedged((cast(Any, positions), weights, population), cast(Any, draws), 100)[1]
+    few = _hedged((cast(Any, positions), weights, population), cast(Any, draws), 100, 0.4)[1]
     assert len(few) == 6 + len(draws)
 
 
@@ -80,10 +80,10 @@ def test_smooth_shapes_get_their_share_and_end_where_no_learnt_shape_reaches() -
     frame = table_frame()
     mug = mug_hypotheses(frame, segment(frame)[0], [0.5, 2.0, 3.0], [0.5, 0.3, 0.2])
     everything = SimpleNamespace(shapes=lambda cube, grid, count, seed: np.ones((count, grid, grid, grid), bool))
-    mixed = _beside_smooth(mug, cast(Any, everything), 4)
+    mixed = _beside_smooth(mug, cast(Any, everything), 4, 0.3)
     learnt = mug.solid.any(axis=0)
     n = len(mug.weights)
-    assert mixed.weights[n:].sum() == pytest.approx(4 / (n + 4))
-    np.testing.assert_allclose(mixed.weights[:n], n / (n + 4) * mug.weights)
+    assert mixed.weights[n:].sum() == pytest.approx(0.3)
+    np.testing.assert_allclose(mixed.weights[:n], 0.7 * mug.weights)
     assert set(mixed.population) == set(mug.population)
     assert (mixed.solid[n:] | learnt == learnt).all() and (mixed.solid[n:].mean() > 0.9 * learnt.mean())
