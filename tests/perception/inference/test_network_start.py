@@ -72,9 +72,11 @@ def test_the_guess_is_the_first_answer_and_tempering_begins_at_the_network(prior
     assert found.log[0].endswith("-> tempering from there") and found.hypotheses.stage > 0
     assert "network" in found.parts and len(np.unique(found.posterior.population)) == 2
     unexplained = 1.0 - found.hypotheses.diagnostics.explained  # the model knows no object
-    draws = round(CONFIG.hypotheses * min(1.0, HEDGE * unexplained))
-    assert draws > 0
-    np.testing.assert_allclose(found.hypotheses.weights[-draws:], 1.0 / len(found.hypotheses.weights))
+    assert HEDGE * unexplained > 1.0 and len(found.hypotheses.weights) == 8
+    two, draws, smooth = np.split(found.hypotheses.weights, [2, 5])  # a shape of each population, and what is mixed in
+    np.testing.assert_allclose(smooth, unexplained / 3)
+    np.testing.assert_allclose(draws, (1.0 - unexplained) * (1.0 - 1.0 / 5) / 3)
+    np.testing.assert_allclose(two.sum(), (1.0 - unexplained) / 5)
 
 
 def _without_depth(frame: Frame) -> Frame:
