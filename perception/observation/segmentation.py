@@ -3,18 +3,19 @@
 With depth the plane is measured. Without, it is supposed (`PlaneGuess`) and colour finds the objects (`MaskConfig`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from perception.observation.colour_masks import label_colour
 from perception.observation.settings import SegmentConfig
-from perception.observation.support_plane import heights, horizontal, noise_growth, over, support_plane
+from perception.observation.standing import candidates, in_box, standing
+from perception.observation.support_plane import heights, horizontal, noise_growth, support_of
 from perception.observation.without_depth import slopes, supposed_plane
 from perception.sources.frame import Frame
 from probnerf.types import FREE, OBJECT, UNKNOWN
@@ -34,56 +35,109 @@ class Segment:
     plane_sigma: tuple[float, float] | None = None  # m, rad; of the height and tilt of a supposed plane; None: measured
 
 
-def segment(frame: Frame, object_id: int | None = None, config: SegmentConfig | None = None) -> list[Segment]:
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Something that was found, and is not taken for an object that can be inferred."""
+
+    id: int
+    mask: Bool[np.ndarray, "h w"]
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Segments(Sequence[Segment]):
+    """The objects of a frame; a sequence of `Segment`."""
+
+    objects: tuple[Segment, ...]
+    left_out: tuple[LeftOut, ...] = ()
+
+    @overload
+    def __getitem__(self, index: int) -> Segment: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Segment, ...]: ...
+    def __getitem__(self, index: int | slice) -> Segment | tuple[Segment, ...]:
+        return self.objects[index]
+
+    def __len__(self) -> int:
+        return len(self.objects)
+
+
+def segment(frame: Frame, object_id: int | None = None, config: SegmentConfig | None = None) -> Segments:
     """The objects of a frame, or the one with `object_id`.
 
-    With a label map its ids are the objects. Without one, points above the support plane are clustered and numbered
-    from the largest. Statuses per object: OBJECT in its mask. FREE where the ray is known to miss it: the depth there
-    is on or below the support plane, or beyond the object, or absent where the label map says background. UNKNOWN
-    otherwise: nearer things, pixels without depth, the rim of the mask, mask pixels whose depth is the background's.
+    With a box (`MaskConfig`) the thing in it is object 1. With a label map its ids are the objects. Without either,
+    points above the supports (`standing`) are clustered and numbered from the largest; what is too large, too low or
+    cut off by the picture's border is left out. Statuses per object: OBJECT in its mask. FREE where the ray is known to
+    miss it: the depth there is on or below the support plane, or beyond the object, or absent where the label map says
+    background. UNKNOWN otherwise: nearer things, pixels without depth, the rim of the mask, mask pixels whose depth is
+    the background's.
 
     Without depth, pixels outside the mask and its rim are FREE, except other masks that may belong to things in front
     of the object. Pixels in no mask count as behind it.
 
-    Raises `ValueError` if there is no plane, no such id, or a mask of a few pixels. Without `object_id` masks that
-    are too small are passed over, unless none is left.
+    Raises `ValueError` if there is no plane, no such id, no object, or a mask of a few pixels.
     """
     config = config or SegmentConfig()
-    where = f"frame at {frame.stamp_ns} ns"
-    if frame.depth is None:
-        try:
-            return _segment_colour(frame, object_id, config)
-        except ValueError as error:
-            raise ValueError(f"{where}: {error}") from None
-    if not np.isfinite(frame.depth).any():
-        raise ValueError(f"{where}: no pixel of {frame.depth.size} has depth; check the depth sensor")
-    points = backproject(frame)
     try:
-        table, on_table = support_plane(points, frame.label, config.plane)
-        if frame.label is None:
-            masks = dict(enumerate(_standing(points, table, on_table, config), start=1))
-        else:
-            masks = {int(i): frame.label == i for i in np.unique(frame.label) if i > 0}
+        if frame.depth is None:
+            return Segments(tuple(_segment_colour(frame, object_id, config)))
+        return _segment_depth(frame, object_id, config)
     except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
-    if object_id is not None and object_id not in masks:
-        raise ValueError(f"{where} has no object {object_id}; its objects: {', '.join(map(str, masks)) or 'none'}")
+        raise ValueError(f"frame at {frame.stamp_ns} ns: {error}") from None
+
+
+def _segment_depth(frame: Frame, object_id: int | None, config: SegmentConfig) -> Segments:
+    """The objects of a frame with depth. Raises as `segment`, without the name of the frame."""
+    assert frame.depth is not None
+    if not np.isfinite(frame.depth).any():
+        raise ValueError(f"no pixel of {frame.depth.size} has depth; check the depth sensor")
+    points, label = backproject(frame), frame.label
+    left = list[LeftOut]()
+    if config.mask.box_px is not None:
+        thing, label = in_box(points, config.mask.box_px, config), None
+        found = {1: (thing.mask, thing.plane)}
+    elif label is not None:
+        ids = [int(i) for i in np.unique(label) if i > 0]
+        if not ids:
+            raise ValueError("the label map names no object; give one with ids from 1, or none")
+        plane = support_of(points, label, candidates(points, config), config.plane)
+        found = {i: (label == i, plane) for i in ids}
+    else:
+        stands = standing(points, frame.camera, config)
+        found = {i: (thing.mask, thing.plane) for i, thing in enumerate(stands.things, start=1)}
+        left = [LeftOut(i, *it) for i, it in enumerate(stands.left_out, start=len(found) + 1)]
+        if not found:
+            raise ValueError(_nothing(left, frame.depth))
+    if object_id is not None and object_id not in found:
+        why = [f"object {it.id} is left out: {it.reason}" for it in left if it.id == object_id]
+        raise ValueError(*why or [f"no object {object_id}; its objects: {', '.join(map(str, found))}"])
     segments = []
-    for i, mask in masks.items():
-        pixels, measured = int(mask.sum()), int((mask & np.isfinite(points[..., 2])).sum())
+    for i, (mask, plane) in found.items():
         if object_id not in (None, i):
             continue
+        pixels, measured = int(mask.sum()), int((mask & np.isfinite(points[..., 2])).sum())
         if measured >= config.min_pixels:
-            plane = _own_plane(points, table, mask, config)
-            segments.append(Segment(i, mask, plane, *_statuses(points, plane, mask, frame.label, config)))
-        elif i == object_id or len(masks) == 1:
-            raise ValueError(
-                f"{where}: object {i} has {pixels} pixels, {measured} of them with depth; at least {config.min_pixels}"
-                " are needed: move the camera nearer or give another object"
-            )
+            own = _own_plane(points, plane, mask, config)
+            segments.append(Segment(i, mask, own, *_statuses(points, own, mask, label, config)))
+            continue
+        reason = f"{pixels} pixels, {measured} of them with depth; at least {config.min_pixels} are needed"
+        if i == object_id or len(found) == 1:
+            raise ValueError(f"object {i} has {reason}: move the camera nearer or give another object")
+        left.append(LeftOut(i, mask, reason))
     if not segments:
-        raise ValueError(f"{where} has no object with {config.min_pixels} pixels of depth; move the camera nearer")
-    return segments
+        raise ValueError(f"no object has {config.min_pixels} pixels of depth; move the camera nearer")
+    return Segments(tuple(segments), tuple(left))
+
+
+def _nothing(left: Sequence[LeftOut], depth: Float[np.ndarray, "h w"]) -> str:
+    """The words for a frame in which nothing is an object."""
+    median = float(np.nanmedian(depth))
+    words = "nothing stands on the support plane; show more of the objects, or give masks, a box or the plane (--plane)"
+    if left:
+        words = f"nothing that stands there can be inferred: {'; '.join(it.reason for it in left[:3])}"
+    if not 0.2 < median < 3.0:  # m; a camera at a table
+        words += f". The depth's median is {median:.3g} m: if that is wrong, correct the depth's unit"
+    return words
 
 
 def _segment_colour(frame: Frame, object_id: int | None, config: SegmentConfig) -> list[Segment]:
@@ -149,115 +203,6 @@ def backproject(frame: Frame) -> Float[np.ndarray, "h w 3"]:
     v, u = np.mgrid[: frame.depth.shape[0], : frame.depth.shape[1]]
     rays = frame.camera.rays(np.column_stack([u.ravel(), v.ravel()]))
     return (rays / rays[:, 2:]).reshape(*u.shape, 3) * frame.depth[..., None]
-
-
-def _standing(
-    points: Float[np.ndarray, "h w 3"],
-    plane: Float[np.ndarray, "4"],
-    on_plane: Bool[np.ndarray, "h w"],
-    config: SegmentConfig,
-) -> list[Bool[np.ndarray, "h w"]]:
-    """Masks of the objects on the plane, the largest first. Raises `ValueError` if none is found."""
-    # The table is the largest patch of the plane; elsewhere the plane may cut a chair or a shelf.
-    patch = _groups(points[on_plane] @ horizontal(plane).T, 0.02)
-    table = points[on_plane][patch == np.bincount(patch).argmax()][::7]
-    height, z = heights(points, plane), points[..., 2]
-    growth = noise_growth(points)
-    high = (height > config.above * growth) & (height < config.max_height)
-    # Where one thing ends before another their outlines are left out, so that things that touch come apart. A level
-    # face seen at a grazing angle spans much depth, but no height.
-    steps = (
-        ndimage.maximum_filter(np.where(high, extent, -np.inf), 3)
-        - ndimage.minimum_filter(np.where(high, extent, np.inf), 3)
-        for extent in (z, height)
-    )
-    solid = high & ~((next(steps) > config.depth_step) & (next(steps) > 0.2 * config.depth_step))
-    where, group = np.argwhere(solid), _groups(points[solid], config.voxel)
-    masks = []
-    for i in np.flatnonzero(np.bincount(group) >= config.min_cluster_pixels):
-        pixels = where[group == i]
-        cloud = points[pixels[:, 0], pixels[:, 1]]
-        if over(cloud[::7], plane, table).mean() < 0.5:
-            continue
-        for piece in _unstack(cloud, heights(cloud, plane), plane, config):
-            mask = np.zeros(solid.shape, bool)
-            mask[pixels[piece, 0], pixels[piece, 1]] = True
-            if len(piece) >= config.min_cluster_pixels and height[mask].max() > config.min_height:
-                masks.append(mask)
-    if not masks:
-        raise ValueError("nothing stands on the support plane; show more of the objects, or give a label map")
-    masks.sort(key=lambda mask: -int(mask.sum()))
-    # Outlines and bases (thinner than `above`) go to what they are next to in space.
-    owner = np.zeros(solid.shape, np.intp)
-    for number, mask in enumerate(masks, start=1):
-        owner[mask] = number
-    loose = (owner == 0) & (height > config.base * growth) & (height < config.max_height)
-    reach = np.where(high[loose], 2.0 * config.voxel, config.voxel)
-    gap, at = cKDTree(points[owner > 0]).query(points[loose], distance_upper_bound=2.0 * config.voxel)
-    owner[loose] = np.where(gap < reach, np.append(owner[owner > 0], 0)[at], 0)
-    return [_filled(owner == number, height / growth, config) for number in range(1, len(masks) + 1)]
-
-
-def _groups(points: Float[np.ndarray, "n d"], voxel: float) -> Int[np.ndarray, "n"]:
-    """Euclidean clusters: the group (0..) of each point, where points in touching voxels are of one group."""
-    if not len(points):
-        return np.zeros(0, np.intp)
-    cells = np.floor((points - points.min(axis=0)) / voxel).astype(np.int64) + 1
-    shape = cells.max(axis=0) + 1
-    keys, of_cell = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(shape)), return_inverse=True)
-    cells = np.stack(np.unravel_index(keys, tuple(shape)), axis=-1)
-    pairs = cKDTree(cells).query_pairs(1.0, p=np.inf, output_type="ndarray")
-    touching = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
-    return connected_components(touching, directed=False)[1][of_cell]
-
-
-def _unstack(
-    cloud: Float[np.ndarray, "n 3"],
-    height: Float[np.ndarray, "n"],
-    plane: Float[np.ndarray, "4"],
-    config: SegmentConfig,
-) -> list[Int[np.ndarray, "m"]]:
-    """Indices of the parts of one cluster, cut where something stands on a level face (a can on a box).
-
-    A level face is a layer of height with far more points than the others; sides fill all layers equally.
-    A part less than half as wide as all below it is a neck, spout or knob, and is not cut off.
-    """
-
-    flat = cloud @ horizontal(plane).T
-
-    def width(part: Bool[np.ndarray, "n"]) -> float:
-        return float(np.ptp(np.percentile(flat[part], [2, 98], axis=0), axis=0).max())
-
-    bins = np.arange(0.0, height.max() + 0.006, 0.006)
-    count = np.histogram(height, bins)[0]
-    layers = count[1:] + count[:-1]  # 12 mm thick, in steps of 6
-    for i in np.flatnonzero(layers > max(0.15 * len(cloud), 6.0 * float(np.median(count)))):
-        level = bins[i + 1]
-        upper = height > level + 0.006 + config.base
-        if level < config.lifted or upper.sum() < config.min_cluster_pixels:
-            continue
-        # It must stand over the face, not beside it: its outline does not continue below.
-        carried = over(cloud[upper], plane, cloud[np.abs(height - level) < 0.006]).mean() > 0.5
-        beneath = cKDTree(flat[height < level - 0.006]).query(flat[upper & (height < level + 0.03)])[0] < config.voxel
-        tall = height.max() > level + config.min_height
-        if carried and tall and beneath.mean() < 0.3 and width(upper) > 0.5 * width(~upper):
-            above, below = np.flatnonzero(upper), np.flatnonzero(~upper)
-            group = _groups(cloud[above], config.voxel)
-            return [below, *(above[group == g] for g in range(group.max() + 1))]
-    return [np.arange(len(cloud))]
-
-
-def _filled(
-    mask: Bool[np.ndarray, "h w"], height: Float[np.ndarray, "h w"], config: SegmentConfig
-) -> Bool[np.ndarray, "h w"]:
-    """A mask with its small gaps in depth, and with what it encloses above the table: the floor of a bowl."""
-    gap = np.isnan(height)
-    mask = mask | (gap & ndimage.binary_closing(mask, iterations=5))
-    inside = ndimage.binary_fill_holes(mask) & ~mask
-    holes, _ = ndimage.label(inside)
-    small = np.bincount(holes.ravel()) < 0.02 * mask.sum()
-    floor = (height > config.base) & (height <= config.above)
-    return mask | (inside & ((gap & small[holes]) | floor))
 
 
 def _own_plane(

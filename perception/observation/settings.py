@@ -9,11 +9,18 @@ from pathlib import Path
 class PlaneConfig:
     """Lengths in metres; those marked * hold up to 1 m from the camera and grow with `noise_growth` beyond."""
 
+    given: tuple[float, float, float, float] | None = None  # a b c d: a x + b y + c z + d = 0 in the camera frame
     tolerance: float = 0.008  # * half thickness of the slab that counts as the plane
-    lowest: float = 0.016  # * objects on the plane have points higher than this
-    highest: float = 0.5  # and lower than this
-    triplets: int = 1000  # planes tried
+    highest: float = 0.5  # objects on the plane have points lower than this
+    least: float = 0.02  # share of the points with depth that makes a plane
+    most: int = 7  # planes that are looked for
+    also: float = 0.25  # another plane is a support, too, if it carries this share of what the first carries
+    triplets: int = 1000  # triplets tried for each
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.given is not None and not 0.0 < math.hypot(*self.given[:3]) < math.inf:
+            raise ValueError(f"plane is {self.given}; give a b c d with a x + b y + c z + d = 0, (a, b, c) not zero")
 
 
 @dataclass(frozen=True)
@@ -66,7 +73,9 @@ class SegmentConfig:
     lifted: float = 0.02  # an object whose lowest points are higher may stand on another object
     min_height: float = 0.02  # of an object found without a label map
     min_pixels: int = 50  # of the smallest usable mask
-    min_cluster_pixels: int = 200
+    min_cluster_pixels: int = 200  # of the smallest thing found without a label map
+    max_side: float = 0.40  # and of the widest
+    cut_off: float = 0.1  # of its longer side in the picture: how much of the border its pixels may take
     rim: int = 2  # px on each side of a mask's outline that are UNKNOWN: mixed pixels, misregistered depth
     mask: MaskConfig = field(default_factory=MaskConfig)  # without depth
     guess: PlaneGuess = field(default_factory=PlaneGuess)  # without depth

@@ -1,4 +1,6 @@
-"""The support plane, found in a frame's points."""
+"""Planes that things may stand on, found in a frame's points."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -17,29 +19,22 @@ def heights(points: Float[np.ndarray, "... 3"], plane: Float[np.ndarray, "4"]) -
     return points @ plane[:3] + plane[3]
 
 
-def support_plane(
-    points: Float[np.ndarray, "h w 3"], label: Int[np.ndarray, "h w"] | None, config: PlaneConfig
-) -> tuple[Float[np.ndarray, "4"], Bool[np.ndarray, "h w"]]:
-    """The support plane (n, d) and its pixels.
+def planes(points: Float[np.ndarray, "h w 3"], config: PlaneConfig) -> list[Float[np.ndarray, "4"]]:
+    """The planes (n, d) of a frame, the camera on their upper side.
 
-    RANSAC over triplets of points up to a quarter of the picture apart, four planes one after the other, each refitted
-    to its inliers by total least squares. The plane with most pixels wins. A plane not perpendicular to the picture's
-    upward direction (a wall) counts a quarter, and one with nothing on it (the floor, a box's top) a tenth. Objects on
-    it are the labelled pixels, or without a label map any points a little higher.
-    Raises `ValueError` if no plane holds a twentieth of the points.
+    RANSAC over triplets of points up to a quarter of the picture apart, one plane after the other, each refitted to its
+    inliers by total least squares. Planes of fewer than `least` of the points are none.
     """
     rng = np.random.default_rng(config.seed)
     size = np.array(points.shape[:2])
     pixels = np.argwhere(np.isfinite(points[..., 2]))
     pixels = pixels[rng.permutation(len(pixels))[:20_000]]
     cloud = points[pixels[:, 0], pixels[:, 1]]
-    growth = noise_growth(cloud)
-    slab = config.tolerance * growth
-    things = np.ones(len(cloud), bool) if label is None else label[pixels[:, 0], pixels[:, 1]] > 0
+    slab = config.tolerance * noise_growth(cloud)
     free = np.ones(len(cloud), bool)  # not yet on a plane
-    best, best_score = None, 0.0
-    for _ in range(4):
-        if free.sum() < max(3, 0.05 * len(cloud)):
+    found = []
+    for _ in range(config.most):
+        if free.sum() < max(3, config.least * len(cloud)):
             break
         seeds = pixels[rng.choice(np.flatnonzero(free), config.triplets)]
         corners = [points[seeds[:, 0], seeds[:, 1]]]
@@ -63,22 +58,43 @@ def support_plane(
             centre = cloud[on].mean(axis=0)
             normal = np.linalg.eigh(np.cov((cloud[on] - centre).T))[1][:, 0]
             plane = np.append(normal, -normal @ centre)
-        plane *= np.sign(plane[3]) or 1.0  # the camera is on the upper side
-        share = on.mean()
+        plane *= np.sign(plane[3]) or 1.0
         free &= ~on
-        if share < 0.05:
-            continue
+        if on.mean() >= config.least:
+            found.append(plane)
+    return found
+
+
+def upward(plane: Float[np.ndarray, "4"]) -> float:
+    """How readily a plane is taken for a support: a quarter if it isn't across the picture's upward direction."""
+    return 1.0 if -plane[1] > 0.1 else 0.25
+
+
+def on_plane(
+    points: Float[np.ndarray, "h w 3"], plane: Float[np.ndarray, "4"], config: PlaneConfig
+) -> Bool[np.ndarray, "h w"]:
+    """The pixels that see a plane, or something as high."""
+    return np.abs(heights(points, plane)) < config.tolerance * noise_growth(points)
+
+
+def support_of(
+    points: Float[np.ndarray, "h w 3"],
+    label: Int[np.ndarray, "h w"],
+    candidates: Sequence[Float[np.ndarray, "4"]],
+    config: PlaneConfig,
+) -> Float[np.ndarray, "4"]:
+    """Of candidates (at least one), the support of labelled pixels: the largest of those that carry most labels."""
+    given, measured = label > 0, np.isfinite(points[..., 2])
+    cloud = points[given & measured][::7]
+    best, best_score = candidates[0], 0.0
+    for plane in candidates:
+        on = on_plane(points, plane, config)
         height = heights(cloud, plane)
-        higher = (height > (0.0 if label is not None else config.lowest * growth)) & (height < config.highest)
-        standing = (higher & over(cloud, plane, cloud[on], -0.02))[things].sum() > things.sum() * (
-            0.001 if label is None else 0.5
-        )
-        score = share * (1.0 if -plane[1] > 0.1 else 0.25) * (1.0 if standing else 0.1)
+        standing = over(cloud, plane, points[on][::7], -0.02) & (height > 0.0) & (height < config.highest)
+        score = on.sum() * upward(plane) * (1.0 if standing.sum() > 0.5 * len(cloud) else 0.1)
         if score > best_score:
             best, best_score = plane, score
-    if best is None:
-        raise ValueError("no support plane was found; show more of the table, or check the depth and its unit")
-    return best, np.abs(heights(points, best)) < config.tolerance * noise_growth(points)
+    return best
 
 
 def horizontal(plane: Float[np.ndarray, "4"]) -> Float[np.ndarray, "2 3"]:

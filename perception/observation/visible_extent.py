@@ -46,11 +46,11 @@ def visible_body(
     centre, across = np.array([centre_x, centre_y]), seen[:, :2]
     reach = float(np.percentile(np.linalg.norm(across - centre, axis=1), 98))
     if reach > _PROTRUDES * max(width, height) / 2:
-        centre, width = _whole_extent(across)
+        centre, width = whole_extent(across)
     return centre, width, height, top_seen
 
 
-def _whole_extent(across: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], float]:
+def whole_extent(across: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], float]:
     """Middle and longest side of the smallest of the rectangles about the points (1% left out at each end)."""
     angle = np.radians(np.arange(0.0, 90.0, 5.0))
     axes = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
