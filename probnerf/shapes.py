@@ -10,8 +10,9 @@ from probnerf.likelihood.dispatch import density_at
 from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.likelihood.position import pose_of, range_offset_of, split_position
 from probnerf.likelihood.settings import Likelihood
+from probnerf.pixel_status import OBJECT, UNKNOWN
 from probnerf.rendering import foam
-from probnerf.types import BASE_Z, OBJECT, POSE_SIZE, UNKNOWN, Observation, Pose
+from probnerf.types import BASE_Z, POSE_SIZE, Observation, Pose
 
 _NOWHERE = 50.0  # cube units; outside every window, so the kernel skips such points
 WALL_ERROR = 0.02  # cube units; error of a wall's position in the prior's shapes

@@ -19,9 +19,6 @@ from numpy.typing import ArrayLike, DTypeLike
 BASE_Z = -0.75
 BODY_EXTENT = 1.4  # the larger of an object's longest horizontal side and its height, without handle and spout
 
-# Pixel statuses of an Observation (object / free / unknown).
-UNKNOWN, OBJECT, FREE = 0, 1, 2
-
 KINDS = ("vessel", "box", "other")  # of things; vessel: any container from bowl to bottle, with or without a lid
 
 # Entries of a position vector that tell the pose: a, b (yaw = atan2(b, a)), x, y, log-scale, range offset, z.
@@ -48,7 +45,7 @@ class Observation(eqx.Module):
     """
 
     rays: Rays
-    status: Int[Array, "n"]  # UNKNOWN, OBJECT or FREE
+    status: Int[Array, "n"]  # UNKNOWN, OBJECT or FREE (probnerf.pixel_status)
     rgb: Float[Array, "n 3"]  # in [0, 1]
     rgb_valid: Bool[Array, "n"]
     range: Float[Array, "n"]  # measured distance along the ray; only read where range_valid (OBJECT pixels)

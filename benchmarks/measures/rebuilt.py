@@ -22,6 +22,7 @@ from probnerf.likelihood.settings import Likelihood
 from probnerf.objects.ray_tracer import handle_occupancy, solid_occupancy, trace
 from probnerf.objects.tabletop import TabletopObject, sample_object
 from probnerf.objects.tabletop_sampler import KINDS, TEXTURES
+from probnerf.pixel_status import FREE, OBJECT
 from probnerf.prior.encoder_input import ENCODER_RADIUS, camera_features, encoder_image
 from probnerf.prior.networks import ProbNeRF
 from probnerf.rendering import foam
@@ -29,7 +30,7 @@ from probnerf.rendering.occupancy import coarsen, solid
 from probnerf.sampling.ascent import ascend
 from probnerf.settings import AdamConfig
 from probnerf.shapes import opacity_grids
-from probnerf.types import FREE, OBJECT, Observation, Rays
+from probnerf.types import Observation, Rays
 
 VIEWS = 4  # given; as many held out
 GRID = 64

@@ -42,11 +42,12 @@ from probnerf.kernel import library
 from probnerf.likelihood import kernel_call
 from probnerf.likelihood.dispatch import log_likelihood, plain_log_likelihood
 from probnerf.likelihood.pixel_terms import faces_of_view
+from probnerf.pixel_status import OBJECT
 from probnerf.prior.checkpoint import load_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering.foam import FAR
 from probnerf.settings import InferConfig
-from probnerf.types import OBJECT, Observation, joined
+from probnerf.types import Observation, joined
 
 
 class Given(eqx.Module):

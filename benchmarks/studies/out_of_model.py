@@ -42,9 +42,9 @@ from perception.inference.controller import estimate
 from perception.inference.settings import ControllerConfig
 from perception.sources.frame import Frame
 from probnerf.objects.tabletop import TEST_SEEDS
+from probnerf.pixel_status import UNKNOWN
 from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.rendering.occupancy import coarsen
-from probnerf.types import UNKNOWN
 
 MESHES = Path(__file__).resolve().parent.parent.parent.parent / "shared" / "data" / "meshes" / "bullet3"
 FAMILY, STRANGERS, NOISE = CONDITIONS = ("the family", "others' meshes", "noise")

@@ -30,7 +30,7 @@ from perception.observation.turntable_views import (
     square,
 )
 from perception.sources.frame import Frame, Source
-from perception.sources.frame_folder import colour_to_rgb, read_png
+from perception.sources.image_files import read_picture
 from perception.sources.open_source import open_source
 from probnerf.training.srn_dataset import read_instance, write_intrinsics, write_view
 
@@ -142,7 +142,7 @@ def capture(options: Capture, out: Console, err: Console) -> bool:
     table = Turntable(options.port, options.table)
     if options.background is not None and not options.background.is_file():
         raise FileNotFoundError(f"--background {options.background} does not exist; give a PNG of the empty plate")
-    background = None if options.background is None else colour_to_rgb(read_png(options.background))
+    background = None if options.background is None else read_picture(options.background)
     todo, skipped, finished = session.missing(), [], False
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     try:

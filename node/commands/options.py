@@ -23,16 +23,81 @@ ENDPOINT = "tcp/127.0.0.1:7448"  # the router of ROS 2 has 7447
 
 
 @dataclass(frozen=True)
-class ReplayConfig:
-    """Infer whole-shape hypotheses for the objects in one recorded view; write a file and a picture for each."""
+class FrameOptions:
+    """One frame of a source, and how its objects are found."""
 
     source: Annotated[
         Positional[Path | None],
         arg(metavar="[SOURCE]", help_behavior_hint="(default: the recording that ships with the project)"),
     ] = None
-    """Frame folder (color.png, depth.png, meta.json) or recording (.mcap, .db3, .bag, ROS 2 bag folder)."""
+    """Frame folder (color.png, depth.png, meta.json), frame in one file (.npz: rgb, depth, K) or recording (.mcap,
+    .db3, .bag, ROS 2 bag folder)."""
     object: Annotated[int | None, arg(metavar="ID", help_behavior_hint="(default: all)")] = None
-    """The one object to infer: its id in the label map. Without a label map: 1, 2, ... from the largest."""
+    """The one object to take: its id in the label map. Without a label map: 1, 2, ... from the largest."""
+    frame: Annotated[int, arg(metavar="K")] = 0
+    """Which frame of a recording (of its range, with --from and --to), from 0; -1 is the last."""
+    start_s: Annotated[float, arg(name="from", metavar="SECONDS")] = 0.0
+    """Skip a recording's frames before this time after its first one."""
+    end_s: Annotated[float | None, arg(name="to", metavar="SECONDS", help_behavior_hint="(default: the end)")] = None
+    """Skip a recording's frames after this time after its first one."""
+    camera: Annotated[
+        Path | None, arg(metavar="FILE.yaml", help_behavior_hint="(default: the intrinsics in the source)")
+    ] = None
+    """Calibration of the colour image (as `farside calibrate` writes it) to use in place of the recorded intrinsics."""
+    colour_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
+    """Colour image of a recording that has several."""
+    depth_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
+    """Depth image of a recording; needed where its name does not say depth, or its frame_id is not colour's."""
+    masks: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the source's label map)")] = None
+    """Label map of an instance segmenter: .png or .npy of ids, or .npy or .npz of masks (n x height x width)."""
+    box: Annotated[
+        tuple[int, int, int, int] | None, arg(metavar="X0 Y0 X1 Y1", help_behavior_hint="(default: none)")
+    ] = None
+    """A box around one whole object, px; X1 and Y1 are the first column and row beyond it."""
+    plane: Annotated[
+        tuple[float, float, float, float] | None, arg(metavar="A B C D", help_behavior_hint="(default: found)")
+    ] = None
+    """The plane that things stand on: A x + B y + C z + D = 0 in the camera's frame (x right, y down, z forward; m)."""
+    colour_only: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Ignore depth. The camera's height and tilt are then needed: see `segment` in launch/replay.yaml."""
+    segment: SegmentConfig = field(default_factory=SegmentConfig)
+
+    @property
+    def topics(self) -> TopicNames:
+        """The chosen topics of the recording."""
+        return TopicNames(self.colour_topic, self.depth_topic)
+
+    @property
+    def segmentation(self) -> SegmentConfig:
+        """How objects are found, with the chosen box and plane. Raises `ValueError` for a plane that is none."""
+        mask = self.segment.mask if self.box is None else replace(self.segment.mask, box_px=self.box)
+        plane = self.segment.plane if self.plane is None else replace(self.segment.plane, given=self.plane)
+        return replace(self.segment, mask=mask, plane=plane)
+
+    @property
+    def folder(self) -> Path:
+        """Where the results go by default."""
+        source = self.source or SHIPPED_LOG
+        return Path("out") / (source.stem if source.is_file() else source.resolve().name)
+
+
+@dataclass(frozen=True)
+class Segmenting(FrameOptions):
+    """Draw and number the objects in one view, before anything is inferred, and write their label map."""
+
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: out/<name of the source>)")] = None
+    """Folder for segments.png (the picture) and label.png (ids: to correct, and to give back with --masks)."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the results go."""
+        return self.out or super().folder
+
+
+@dataclass(frozen=True)
+class ReplayConfig(FrameOptions):
+    """Infer whole-shape hypotheses for the objects in one recorded view; write a file and a picture for each."""
+
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: out/<name of the source>)")] = None
     """Folder for object_<id>.npz and object_<id>.png, and for the frame itself (frame/)."""
     budget: Annotated[
@@ -48,31 +113,10 @@ class ReplayConfig:
         arg(metavar="{tempered_smc,annealed_hmc}", help_behavior_hint="(default: tempered_smc)"),
     ] = None
     """Sampler: weighted tempered populations, or the annealed chains of the ProbNeRF paper."""
-    frame: Annotated[int, arg(metavar="K")] = 0
-    """Which frame of a recording (of its range, with --from and --to), from 0; -1 is the last."""
-    start_s: Annotated[float, arg(name="from", metavar="SECONDS")] = 0.0
-    """Skip a recording's frames before this time after its first one."""
-    end_s: Annotated[float | None, arg(name="to", metavar="SECONDS", help_behavior_hint="(default: the end)")] = None
-    """Skip a recording's frames after this time after its first one."""
     schedule: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Repeat the inferences in a recording's schedule, which gives their frames, stages and seeds."""
-    camera: Annotated[
-        Path | None, arg(metavar="FILE.yaml", help_behavior_hint="(default: the intrinsics in the source)")
-    ] = None
-    """Calibration of the colour image (as `farside calibrate` writes it) to use in place of the recorded intrinsics."""
-    colour_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
-    """Colour image of a recording that has several."""
-    depth_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
-    """Depth image of a recording; needed where its name does not say depth, or its frame_id is not colour's."""
     prior: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the shipped one)")] = None
     """Weights of another prior (.safetensors, as `farside train` writes them)."""
-    colour_only: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Ignore depth. The camera's height and tilt are then needed: see `segment` in launch/replay.yaml."""
-    box: Annotated[
-        tuple[int, int, int, int] | None, arg(metavar="X0 Y0 X1 Y1", help_behavior_hint="(default: none)")
-    ] = None
-    """Without depth: a box around the whole object, px; X1 and Y1 are the first column and row beyond it."""
-    segment: SegmentConfig = field(default_factory=SegmentConfig)
     controller: ControllerConfig = field(default_factory=ControllerConfig)
     track: TrackConfig = field(default_factory=TrackConfig)  # of a schedule
 
@@ -92,15 +136,9 @@ class ReplayConfig:
         return replace(self.controller, infer=replace(self.controller.infer, method=self.method))
 
     @property
-    def topics(self) -> TopicNames:
-        """The chosen topics of the recording."""
-        return TopicNames(self.colour_topic, self.depth_topic)
-
-    @property
     def folder(self) -> Path:
         """Where the results go."""
-        source = self.source or SHIPPED_LOG
-        return self.out or Path("out") / (source.stem if source.is_file() else source.resolve().name)
+        return self.out or super().folder
 
 
 @dataclass(frozen=True)

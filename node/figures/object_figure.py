@@ -18,7 +18,8 @@ from perception.answers.hypotheses import Hypotheses
 from perception.answers.summary import sticks_out, summarise
 from perception.observation.segmentation import Segment
 from perception.sources.frame import Frame
-from probnerf.types import BASE_Z, UNKNOWN
+from probnerf.pixel_status import UNKNOWN
+from probnerf.types import BASE_Z
 
 SHOWN = 4  # hypotheses in a picture
 _LINE, _LEGEND = 0.058, 0.17  # of the summary: height of a line of 8 points, and of the legend below (axes)

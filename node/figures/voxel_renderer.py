@@ -12,8 +12,9 @@ from calibration.camera import Camera
 from perception.answers.hypotheses import Hypotheses
 from perception.observation.object_frame import ObjectFrame
 from probnerf.geometry import look_at, pinhole_rays
+from probnerf.pixel_status import FREE, OBJECT, UNKNOWN
 from probnerf.rendering.voxel_rays import met, nearest
-from probnerf.types import BASE_Z, FREE, OBJECT, UNKNOWN
+from probnerf.types import BASE_Z
 
 RADIUS = 1.15  # a picture shows this much around the cube's centre
 SEEN, UNSEEN = np.array([0.62, 0.70, 0.78]), np.array([0.95, 0.60, 0.28])  # paint of surface the camera saw, or not

@@ -15,7 +15,8 @@ from perception.sources.settings import SHIPPED_LOG
 from probnerf.compile_cache import rehearsal
 from probnerf.inference import infer
 from probnerf.network_start import network_used
-from probnerf.types import FREE, UNKNOWN, Posterior, StopReason
+from probnerf.pixel_status import FREE, UNKNOWN
+from probnerf.types import Posterior, StopReason
 
 
 def warm_up(tracker: Tracker) -> None:

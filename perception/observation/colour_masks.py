@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from perception.observation.settings import MaskConfig
 from perception.sources.frame import Frame
-from perception.sources.frame_folder import colour_to_rgb, read_png
+from perception.sources.image_files import read_picture
 
 _SQUARE = np.ones((3, 3), bool)
 
@@ -26,7 +26,7 @@ def label_colour(frame: Frame, config: MaskConfig) -> Int32[np.ndarray, "h w"]:
             part[part == 0] = number
         return label
     if config.background is not None:
-        picture = colour_to_rgb(read_png(config.background))
+        picture = read_picture(config.background)
         try:
             return changed(frame.rgb, picture, config)
         except ValueError as error:

@@ -6,9 +6,10 @@ from perception.observation.object_frame import ObjectFrame
 from perception.observation.segmentation import Segment
 from perception.sources.frame import Frame
 from probnerf.geometry import look_at, pinhole_rays
+from probnerf.pixel_status import OBJECT, UNKNOWN
 from probnerf.prior.encoder_input import ENCODER_RADIUS
 from probnerf.prior.posterior_network import EncoderPicture
-from probnerf.types import OBJECT, UNKNOWN, on_device
+from probnerf.types import on_device
 
 
 def crop(frame: Frame, segment: Segment, cube: ObjectFrame, size: int) -> EncoderPicture:

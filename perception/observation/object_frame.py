@@ -13,7 +13,8 @@ from perception.observation.support_plane import heights
 from perception.observation.visible_extent import visible_body
 from perception.observation.without_depth import standing_body
 from perception.sources.frame import Frame
-from probnerf.types import BASE_Z, BODY_EXTENT, OBJECT
+from probnerf.pixel_status import OBJECT
+from probnerf.types import BASE_Z, BODY_EXTENT
 
 # The larger of a body's width and height is this many cube units: the scale convention of the prior.
 

@@ -11,7 +11,8 @@ from perception.observation.object_frame import ObjectFrame, object_frame
 from perception.observation.segmentation import Segment
 from perception.observation.settings import ObserveConfig
 from perception.sources.frame import Frame
-from probnerf.types import FREE, OBJECT, UNKNOWN, Observation, Rays, on_device
+from probnerf.pixel_status import FREE, OBJECT, UNKNOWN
+from probnerf.types import Observation, Rays, on_device
 
 NO_LIMIT = 1e3  # cube units: a ray that misses the object without an end
 

@@ -18,7 +18,7 @@ from perception.observation.standing import candidates, in_box, standing
 from perception.observation.support_plane import heights, horizontal, noise_growth, support_of
 from perception.observation.without_depth import slopes, supposed_plane
 from perception.sources.frame import Frame
-from probnerf.types import FREE, OBJECT, UNKNOWN
+from probnerf.pixel_status import FREE, OBJECT, UNKNOWN
 
 _SQUARE = np.ones((3, 3), bool)
 
@@ -30,7 +30,7 @@ class Segment:
     id: int  # of the label map; without one 1..n by size
     mask: Bool[np.ndarray, "h w"]  # the object's pixels, with or without depth
     plane: Float[np.ndarray, "4"]  # (n, d): n.p + d = 0 in the camera frame, n unit and up, d the camera's height (m)
-    status: Int[np.ndarray, "h w"]  # OBJECT, FREE or UNKNOWN (probnerf.types)
+    status: Int[np.ndarray, "h w"]  # OBJECT, FREE or UNKNOWN (probnerf.pixel_status)
     occluder: Bool[np.ndarray, "h w"]  # UNKNOWN pixels that see something else: their ray is free up to its depth
     plane_sigma: tuple[float, float] | None = None  # m, rad; of the height and tilt of a supposed plane; None: measured
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from calibration.camera import Camera
 from perception.observation.settings import PlaneGuess
 from perception.sources.frame import Frame
-from probnerf.types import FREE
+from probnerf.pixel_status import FREE
 
 # Added to the prior's standard deviations without depth (cube units towards the camera and across, log-scale): for
 # bodies with a round foot, and for others, whose depth is not visible in a silhouette. From validation objects.

@@ -1,7 +1,6 @@
-"""The frame folder: color.png, depth.png, label.png and meta.json, read and written."""
+"""The frame folder: colour, depth, label map and meta.json, read and written."""
 
 import json
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -12,52 +11,71 @@ from jaxtyping import Float, Shaped, UInt8
 from calibration.camera import Camera
 from foundation.whole_file import write_whole
 from perception.sources.frame import SATURATED, Frame, known_counts
+from perception.sources.image_files import read_npy, read_picture, read_png
+from perception.sources.label_map import read_label_map
+from perception.sources.registration import registered
 from probnerf.geometry import rigid
 
 DEPTH_UNIT_M = 1e-4  # of the depth.png that is written; 1 mm where that does not reach far enough
 # Keys of meta.json, and their shapes, for the camera's K_std, distortion_std and rms.
 _DEVIATIONS: dict[str, tuple[int, ...]] = {"camera_matrix_std_px": (3, 3), "distortion_std": (-1,), "rms_px": ()}
-_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+COLOURS = ("color.png", "color.jpg", "color.jpeg", "rgb.png", "rgb.jpg", "rgb.jpeg")  # the first one that exists
+
+
+def is_frame_folder(path: Path) -> bool:
+    """Whether a path is meant as a frame folder, whole or not."""
+    return any((path / name).exists() for name in ("meta.json", *COLOURS))
 
 
 def read_frame_folder(path: Path | str) -> Frame:
-    """The frame in a folder: color.png, meta.json, and depth.png and label.png where they are.
+    """The frame in a folder: colour, meta.json, and depth and a label map where they are.
 
-    depth.png has 16 bits, and 0 or 65535 where depth is unknown. meta.json gives `camera_matrix_px` (3x3) and
-    `depth_unit_m` (m per count), and may give `distortion` and `distortion_model` (as `Camera`; none by default),
-    their errors (`camera_matrix_std_px`, `distortion_std`, `rms_px`), `stamp_ns` (0), `frame_id` ("camera") and
-    `T_world_camera` (4x4, m). Other keys are ignored. Without depth.png and depth_unit_m it is a frame without depth.
-    Raises `FileNotFoundError` or `ValueError` naming the file and the remedy.
+    Colour is color.png, color.jpg, rgb.png or rgb.jpg. Depth is depth.png (16 bits, 0 or 65535 where unknown) or
+    depth.npy (m; integers are counts as in depth.png). The label map is label.png, label.npy or label.npz (see
+    `read_label_map`). meta.json gives `camera_matrix_px` (3x3) and, for counts, `depth_unit_m` (m per count), and may
+    give `distortion` and `distortion_model` (as `Camera`; none by default), their errors (`camera_matrix_std_px`,
+    `distortion_std`, `rms_px`), `stamp_ns` (0), `frame_id` ("camera") and `T_world_camera` (4x4, m). For depth with
+    pixels of its own it gives `depth_camera_matrix_px` and, from another place, `T_color_depth` (4x4, m). Other keys
+    are ignored. Without depth it is a frame without depth. Raises `FileNotFoundError` or `ValueError` naming the file
+    and the remedy.
     """
     path = Path(path)
-    meta = _read_meta(path / "meta.json", depth=(path / "depth.png").exists())
+    counts = None
+    if (path / "depth.npy").exists():
+        counts = read_npy(path / "depth.npy")
+    floats = counts is not None and counts.dtype.kind == "f"
+    meta = _read_meta(path / "meta.json", depth=not floats and (counts is not None or (path / "depth.png").exists()))
     unit = meta.get("depth_unit_m")
-    colour = read_png(path / "color.png")
-    if colour.dtype != np.uint8:
-        raise ValueError(f"{path / 'color.png'} has {colour.dtype} samples; save it with 8 bits a channel")
-    rgb = colour_to_rgb(colour)
+    rgb = read_picture(next((path / name for name in COLOURS if (path / name).exists()), path / COLOURS[0]))
     height, width = rgb.shape[:2]
-    counts = None if unit is None else read_png(path / "depth.png")
-    if counts is not None and (counts.dtype != np.uint16 or counts.ndim != 2):
-        raise ValueError(f"{path / 'depth.png'} is {counts.dtype}{list(counts.shape)}; save one channel of 16 bits")
-    label = read_png(path / "label.png") if (path / "label.png").exists() else None
-    if label is not None and label.ndim != 2:
-        raise ValueError(f"{path / 'label.png'} has {label.shape[2]} channels; save one channel of object ids")
-    for name, image in (("depth.png", counts), ("label.png", label)):
-        if image is not None and image.shape != (height, width):
-            raise ValueError(
-                f"{path / name} is {image.shape[1]}x{image.shape[0]} px but color.png is {width}x{height};"
-                f" align {name} to color.png"
-            )
+    source = path / ("depth.png" if counts is None else "depth.npy")
+    if counts is None and unit is not None:
+        counts = read_png(source)
+        if counts.dtype != np.uint16 or counts.ndim != 2:
+            raise ValueError(f"{source} is {counts.dtype}{list(counts.shape)}; save one channel of 16 bits")
+    if counts is not None and counts.ndim != 2:
+        raise ValueError(f"{source} is {counts.dtype}{list(counts.shape)}; save one value a pixel")
+    own = meta["depth_camera_matrix_px"]
+    if counts is not None and counts.shape != (height, width) and own is None:
+        raise ValueError(
+            f"{source} is {counts.shape[1]}x{counts.shape[0]} px but the colour is {width}x{height}; align it to the"
+            " colour, or give its own camera in meta.json (depth_camera_matrix_px, T_color_depth)"
+        )
     depth = None
-    if counts is not None:  # Frame turns 0 into NaN
+    if counts is not None and floats:
+        depth = counts.astype(np.float32)
+    elif counts is not None:  # Frame turns 0 into NaN
         depth = (known_counts(counts) * np.float64(unit)).astype(np.float32)
+    labels = [path / f"label{suffix}" for suffix in (".png", ".npy", ".npz") if (path / f"label{suffix}").exists()]
+    label = read_label_map(labels[0], (height, width)) if labels else None
     try:
         optics = [meta[key] for key in ("camera_matrix_px", "distortion", "distortion_model", *_DEVIATIONS)]
         camera = Camera(width, height, *optics)
+        if depth is not None and own is not None:
+            depth_camera = Camera(depth.shape[1], depth.shape[0], own, np.zeros(5))
+            depth = registered(depth, depth_camera, camera, meta["T_color_depth"])
     except ValueError as error:
         raise ValueError(f"{path / 'meta.json'}: {error}") from None
-    label = None if label is None else label.astype(np.int32)
     known = {name: meta[name] for name in ("stamp_ns", "frame_id", "T_world_camera")}
     try:
         return Frame(rgb, depth, camera, label=label, **known)
@@ -109,37 +127,6 @@ def write_frame_folder(path: Path | str, frame: Frame) -> None:
     write_whole(path / "meta.json", json.dumps(meta, indent=1))
 
 
-def read_png(path: Path) -> Shaped[np.ndarray, "h w *c"]:
-    """The samples of a PNG, colours in OpenCV's order BGR(A). Raises where the file is absent, cut short or damaged."""
-    try:
-        data = path.read_bytes()
-    except (FileNotFoundError, NotADirectoryError):
-        raise FileNotFoundError(f"{path} is missing; a frame folder holds color.png, depth.png and meta.json") from None
-    if not data.startswith(_PNG_MAGIC):
-        raise ValueError(f"{path} is not a PNG; save it again as PNG")
-    # OpenCV fills missing data with zeros and only prints a warning, so the chunks are checked first.
-    at, kind = len(_PNG_MAGIC), b""
-    while kind != b"IEND":
-        size = int.from_bytes(data[at : at + 4], "big")
-        kind, end = data[at + 4 : at + 8], at + 12 + size
-        if end > len(data):
-            raise ValueError(f"{path} is cut short at byte {len(data)}; copy it again")
-        if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            raise ValueError(f"{path} is damaged near byte {at}; copy it again")
-        at = end
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise ValueError(f"{path} cannot be decoded; save it again as PNG")
-    return image
-
-
-def colour_to_rgb(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w 3"]:
-    """RGB from what OpenCV decodes: grey, BGR or BGRA."""
-    if image.ndim == 2 or image.shape[2] == 1:
-        return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)
-    return np.ascontiguousarray(image[:, :, 2::-1])
-
-
 def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
     """meta.json, its keys checked, and what it may omit filled in; depth_unit_m where there is `depth`."""
     try:
@@ -156,7 +143,7 @@ def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
     if "depth_unit_m" in meta and not (number and 0 < unit <= 1):
         raise ValueError(f"{path}: depth_unit_m is {unit!r}; give metres per count, such as 0.001")
     optional = {"distortion": [0.0] * 5, "distortion_model": "plumb_bob", "stamp_ns": 0, "frame_id": "camera"}
-    meta = {**optional, **dict.fromkeys(("T_world_camera", *_DEVIATIONS)), **meta}
+    meta = {**optional, **dict.fromkeys(("T_world_camera", "T_color_depth", "depth_camera_matrix_px", *_DEVIATIONS)), **meta}
     for key, default in optional.items():
         if isinstance(meta[key], bool) or not isinstance(meta[key], type(default)):
             raise ValueError(f"{path}: {key} is {meta[key]!r}; give something like {default!r}, or omit it")
@@ -166,12 +153,16 @@ def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
         if meta[key] is not None:
             values = _numbers(path, key, meta[key], shape if shape != (-1,) else meta["distortion"].shape)
             meta[key] = values if shape else float(values)
-    if (T := meta["T_world_camera"]) is not None:
-        meta["T_world_camera"] = _numbers(path, "T_world_camera", T, (4, 4))
-        if not np.allclose(meta["T_world_camera"][3], [0, 0, 0, 1]):
-            raise ValueError(f"{path}: T_world_camera has last row {T[3]}; it must be 0 0 0 1 (is it transposed?)")
-        if not rigid(meta["T_world_camera"]):
-            raise ValueError(f"{path}: T_world_camera {T} is no rotation with a translation (m) beside it")
+    if meta["depth_camera_matrix_px"] is not None:
+        own = meta["depth_camera_matrix_px"]
+        meta["depth_camera_matrix_px"] = _numbers(path, "depth_camera_matrix_px", own, (3, 3))
+    for key in ("T_world_camera", "T_color_depth"):
+        if (T := meta[key]) is not None:
+            meta[key] = _numbers(path, key, T, (4, 4))
+            if not np.allclose(meta[key][3], [0, 0, 0, 1]):
+                raise ValueError(f"{path}: {key} has last row {T[3]}; it must be 0 0 0 1 (is it transposed?)")
+            if not rigid(meta[key]):
+                raise ValueError(f"{path}: {key} {T} is no rotation with a translation (m) beside it")
     return meta
 
 

@@ -5,15 +5,16 @@ from pathlib import Path
 
 from calibration.camera import Camera
 from perception.sources.frame import Source, StillSource
-from perception.sources.frame_folder import read_frame_folder
+from perception.sources.frame_arrays import read_frame_arrays
+from perception.sources.frame_folder import is_frame_folder, read_frame_folder
 from perception.sources.settings import SHIPPED_LOG
 from perception.sources.topic_names import TopicNames
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
 # What a source may be, for messages.
 SOURCES = (
-    "oak, oak:ID, webcam:N, a video file (.mp4, .avi, .mkv), a frame folder (color.png, depth.png, meta.json)"
-    " or a recording (.mcap, .bag, ROS 2 bag folder)"
+    "oak, oak:ID, webcam:N, a video file (.mp4, .avi, .mkv), a frame folder (color.png, depth.png, meta.json),"
+    " a frame in one file (.npz: rgb, depth, K) or a recording (.mcap, .bag, ROS 2 bag folder)"
 )
 
 
@@ -21,7 +22,7 @@ def open_source(path: Path | str | None, camera: Camera | None = None, topics: T
     """The source that `path` names; None is the log shipped with the project.
 
     `oak` or `oak:ID` is an OAK camera, `webcam:N` the camera /dev/videoN; else a video file (by its suffix), a frame
-    folder (it holds color.png) or a log. For a file of such a name write ./oak. `camera` is the calibration for a
+    folder (it holds color.png), a .npz file with a frame, or a log. For a file of such a name write ./oak. `camera` is the calibration for a
     webcam or a video file, or replaces that of an OAK camera, a log or a frame folder. It must have the size of the
     images. `topics` replace the topics that `Log` finds in a log.
 
@@ -37,15 +38,15 @@ def open_source(path: Path | str | None, camera: Camera | None = None, topics: T
 
         return Webcam(which, camera)
     path = SHIPPED_LOG if path is None else Path(path)
-    is_folder = (path / "color.png").exists() or (path / "meta.json").exists()
+    is_folder = is_frame_folder(path)
     if not is_folder and not path.exists():
         raise FileNotFoundError(f"{path} does not exist; give {SOURCES}")
     if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file():
         from perception.sources.webcam import VideoFile
 
         return VideoFile(path, camera)
-    if is_folder:
-        frame = read_frame_folder(path)
+    if is_folder or path.suffix.lower() == ".npz":
+        frame = read_frame_folder(path) if is_folder else read_frame_arrays(path)
         try:
             return StillSource((frame if camera is None else replace(frame, camera=camera),))
         except ValueError as error:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from perception.sources.frame import Frame, Source
-from perception.sources.frame_folder import colour_to_rgb, read_png
+from perception.sources.image_files import colour_to_rgb, read_png
 from perception.sources.open_source import VIDEO_SUFFIXES, open_source
 from perception.sources.reader import Reader
 from perception.sources.recording import first_messages, open_log

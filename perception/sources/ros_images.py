@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
 from perception.sources.frame import known_counts
-from perception.sources.frame_folder import colour_to_rgb
+from perception.sources.image_files import colour_to_rgb
 
 POSE_TOPIC = "/camera/color/pose"  # where a Farside recording keeps T_world_camera (geometry_msgs/PoseStamped)
 MM = np.float32(1e-3)

@@ -11,8 +11,9 @@ from probnerf.compile_cache import program
 from probnerf.fields.base import Field, Model
 from probnerf.likelihood.position import range_offset_of, split_position
 from probnerf.likelihood.settings import Likelihood
+from probnerf.pixel_status import FREE, OBJECT
 from probnerf.rendering import foam
-from probnerf.types import FREE, OBJECT, Observation, Pose
+from probnerf.types import Observation, Pose
 
 
 @program(rehearse=False)

@@ -20,8 +20,9 @@ from probnerf.fields.cylinder import CylinderModel
 from probnerf.likelihood.pixel_terms import faces_of_view, mean_colour
 from probnerf.likelihood.position import range_offset_of, split_position
 from probnerf.likelihood.settings import Likelihood
+from probnerf.pixel_status import FREE, OBJECT, UNKNOWN
 from probnerf.rendering import foam
-from probnerf.types import FREE, OBJECT, UNKNOWN, Observation, Rays
+from probnerf.types import Observation, Rays
 
 Args = tuple[CylinderModel, Likelihood, Observation, Float[Array, "n m"]]  # arguments of `dispatch.log_likelihood`
 

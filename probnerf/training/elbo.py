@@ -28,6 +28,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from probnerf.likelihood.dispatch import map_with_gradient, weighted_terms
 from probnerf.likelihood.settings import Likelihood
+from probnerf.pixel_status import FREE, OBJECT
 from probnerf.prior.encoder_input import camera_features, encoder_image
 from probnerf.prior.networks import ProbNeRF, Recognition
 from probnerf.rendering import foam
@@ -36,7 +37,7 @@ from probnerf.training.pictures import ViewSet
 from probnerf.training.run_folder import RunFolder
 from probnerf.training.settings import TrainConfig
 from probnerf.training.shape_set import DESCRIPTION, ShapeBatch, ShapeSet, batch_of, draw_shapes
-from probnerf.types import FREE, OBJECT, Observation, Pose, Rays
+from probnerf.types import Observation, Pose, Rays
 
 BEHIND = 0.04  # cube units; a lattice of 32 can have a face this far behind a surface, so it needs colours there
 

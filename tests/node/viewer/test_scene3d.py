@@ -12,7 +12,8 @@ from perception.answers.query import query
 from perception.answers.regions import Box, Points
 from perception.observation.segmentation import segment
 from perception.sources.frame import Frame
-from probnerf.types import BASE_Z, OBJECT, StopReason
+from probnerf.pixel_status import OBJECT
+from probnerf.types import BASE_Z, StopReason
 from tests.node.mugs import mug_hypotheses, table_frame
 
 

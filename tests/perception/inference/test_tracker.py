@@ -23,10 +23,11 @@ from perception.sources.frame import Frame
 from probnerf.fields.cylinder import CylinderModel
 from probnerf.inference import InferConfig
 from probnerf.objects.tabletop import part_distances
+from probnerf.pixel_status import UNKNOWN
 from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.settings import quick_smc
-from probnerf.types import UNKNOWN, Diagnostics, Posterior
+from probnerf.types import Diagnostics, Posterior
 from tests.node.mugs import CAMERA, MUG
 from tests.perception.answers.test_query import BODY, _fill, _object
 from tests.perception.cylinders import CAN, Cylinder, looking_down, picture

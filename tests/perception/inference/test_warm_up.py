@@ -23,12 +23,13 @@ from perception.sources.settings import SHIPPED_LOG
 from probnerf import compile_cache, inference, shapes
 from probnerf.kernel import library
 from probnerf.likelihood import pixel_terms
+from probnerf.pixel_status import UNKNOWN
 from probnerf.prior import posterior_network
 from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.sampling import modes, tempered_smc
 from probnerf.settings import InferConfig, quick_smc
-from probnerf.types import UNKNOWN, StopReason
+from probnerf.types import StopReason
 from tests.node.shapes import body_with_handle
 
 

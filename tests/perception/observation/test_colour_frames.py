@@ -21,13 +21,14 @@ from perception.sources.frame import Frame
 from probnerf.fields.cylinder import CylinderModel
 from probnerf.likelihood.position import pose_of
 from probnerf.objects.tabletop import VALIDATION_SEEDS, signed_distance
+from probnerf.pixel_status import FREE, OBJECT, UNKNOWN
 from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering.occupancy import voxel_centres
 from probnerf.sampling.hmc import StageInfo
 from probnerf.settings import InferConfig, quick_smc
 from probnerf.shapes import scaled_about
-from probnerf.types import BASE_Z, FREE, OBJECT, UNKNOWN
+from probnerf.types import BASE_Z
 from tests.perception.cylinders import CAN, Cylinder, looking_down, picture
 from tests.priors import TABLETOP
 

@@ -12,7 +12,7 @@ from perception.observation.colour_masks import changed, label_colour
 from perception.observation.segmentation import Segment, segment
 from perception.observation.settings import MaskConfig, PlaneGuess, SegmentConfig
 from perception.sources.frame import Frame
-from probnerf.types import FREE, OBJECT, UNKNOWN
+from probnerf.pixel_status import FREE, OBJECT, UNKNOWN
 from tests.perception.cylinders import CAN, Cylinder, looking_down, picture
 
 BOX = (125, 70, 195, 155)  # about CAN

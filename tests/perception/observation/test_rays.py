@@ -16,8 +16,9 @@ from perception.observation.settings import ObserveConfig
 from perception.observation.visibility import inside_view, seen_voxels
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import read_frame_folder
+from probnerf.pixel_status import FREE, OBJECT, UNKNOWN
 from probnerf.prior.checkpoint import load_prior
-from probnerf.types import BASE_Z, BODY_EXTENT, FREE, OBJECT, UNKNOWN, Observation
+from probnerf.types import BASE_Z, BODY_EXTENT, Observation
 from tests.perception.cylinders import CAN, Cylinder, looking_down, picture, to_camera, to_world
 from tests.priors import TABLETOP
 

@@ -12,7 +12,7 @@ from perception.observation.settings import SegmentConfig
 from perception.observation.support_plane import heights
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import read_frame_folder
-from probnerf.types import FREE, OBJECT, UNKNOWN
+from probnerf.pixel_status import FREE, OBJECT, UNKNOWN
 from tests.perception.cylinders import CAMERA, CAN, TABLE_RADIUS, Cylinder, looking_down, picture
 
 

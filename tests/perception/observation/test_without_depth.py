@@ -14,7 +14,7 @@ from perception.observation.without_depth import StandingBody, plane_depth, stan
 from perception.simulation.simulated_camera import PlacedObject, TableScene, place_camera, render
 from perception.sources.frame import Frame
 from probnerf.objects.tabletop import VALIDATION_SEEDS
-from probnerf.types import FREE, OBJECT
+from probnerf.pixel_status import FREE, OBJECT
 from tests.perception.cylinders import CAMERA, CAN, Cylinder, looking_down, picture, to_camera
 
 NOTHING = np.zeros((240, 320), bool)

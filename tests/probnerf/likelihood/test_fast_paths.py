@@ -15,9 +15,9 @@ import pytest
 from probnerf.likelihood.dispatch import log_likelihood, map_with_gradient
 from probnerf.likelihood.pixel_terms import faces_of_view, log_likelihood_one
 from probnerf.objects.cylinder_scenes import scene
+from probnerf.pixel_status import FREE
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering.foam import FAR
-from probnerf.types import FREE
 
 
 @pytest.mark.parametrize("condition", ["half", pytest.param("seen", marks=pytest.mark.slow)])

@@ -14,11 +14,12 @@ from probnerf.likelihood import kernel_call
 from probnerf.likelihood.dispatch import log_likelihood, plain_log_likelihood
 from probnerf.likelihood.pixel_terms import faces_of_view, pixel_terms
 from probnerf.likelihood.settings import Likelihood
+from probnerf.pixel_status import FREE, OBJECT, UNKNOWN
 from probnerf.prior.checkpoint import load_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering.foam import Lattice, window
 from probnerf.shapes import explained, opacity_grids
-from probnerf.types import FREE, OBJECT, UNKNOWN, Observation, Pose, Rays
+from probnerf.types import Observation, Pose, Rays
 
 ISAS = ("avx512", "avx2", "plain")
 FIELDS = {

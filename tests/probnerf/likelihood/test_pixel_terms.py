@@ -13,10 +13,11 @@ from probnerf.likelihood.pixel_terms import faces_of_view, log_likelihood_one, p
 from probnerf.likelihood.position import pose_of, split_position
 from probnerf.likelihood.settings import Likelihood
 from probnerf.objects.cylinder_scenes import grid_of_rays, scene
+from probnerf.pixel_status import FREE, OBJECT, UNKNOWN
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering import foam
 from probnerf.rendering.foam import FAR, Lattice
-from probnerf.types import FREE, OBJECT, UNKNOWN, Observation, Rays
+from probnerf.types import Observation, Rays
 
 MODEL = CylinderModel()
 LIKELIHOOD = Likelihood(Lattice(16))

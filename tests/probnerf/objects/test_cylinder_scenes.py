@@ -29,11 +29,12 @@ from probnerf.objects.cylinder_scenes import (
     total_variation,
     yaw_histogram,
 )
+from probnerf.pixel_status import OBJECT
 from probnerf.rendering.foam import Lattice
 from probnerf.sampling.annealed_hmc import annealed_hmc
 from probnerf.sampling.tempered_smc import tempered_smc
 from probnerf.settings import AnnealedHMCConfig
-from probnerf.types import OBJECT, Posterior
+from probnerf.types import Posterior
 
 CONDITIONS = [(condition, depth) for condition in YAW_OF for depth in (False, True)]
 QUICK = [("hidden", True)]

@@ -10,12 +10,13 @@ from probnerf.geometry import look_at, pinhole_rays
 from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.likelihood.position import pose_of, split_position
 from probnerf.likelihood.settings import Likelihood
+from probnerf.pixel_status import FREE, OBJECT
 from probnerf.rendering import foam
 from probnerf.sampling.ascent import ascend
 from probnerf.sampling.map_estimate import MAPConfig, map_estimate
 from probnerf.sampling.modes import log_posterior
 from probnerf.settings import AdamConfig
-from probnerf.types import FREE, OBJECT, Observation, Rays
+from probnerf.types import Observation, Rays
 
 MODEL = CylinderModel()
 LIKELIHOOD = Likelihood(lattice=foam.Lattice(16, 1.1), wall_sigma=0.05)

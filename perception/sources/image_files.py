@@ -1,0 +1,102 @@
+"""Images and arrays as files: PNG, JPEG, .npy and .npz, checked before they are decoded."""
+
+import zipfile
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Shaped, UInt8
+
+_PNG_MAGIC, _JPEG_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+LARGEST = 1 << 26  # values of an array; a picture of 16 million pixels in RGBA
+
+
+def read_png(path: Path) -> Shaped[np.ndarray, "h w *c"]:
+    """The samples of a PNG, colours in OpenCV's order BGR(A). Raises where the file is absent, cut short or damaged."""
+    data = _bytes(path)
+    if not data.startswith(_PNG_MAGIC):
+        raise ValueError(f"{path} is not a PNG; save it again as PNG")
+    # OpenCV fills missing data with zeros and only prints a warning, so the chunks are checked first.
+    at, kind = len(_PNG_MAGIC), b""
+    while kind != b"IEND":
+        size = int.from_bytes(data[at : at + 4], "big")
+        kind, end = data[at + 4 : at + 8], at + 12 + size
+        if end > len(data):
+            raise ValueError(f"{path} is cut short at byte {len(data)}; copy it again")
+        if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            raise ValueError(f"{path} is damaged near byte {at}; copy it again")
+        at = end
+    return _decoded(path, data, "PNG")
+
+
+def read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    """The colours (RGB) of a PNG or JPEG. Raises as `read_png`."""
+    data = _bytes(path)
+    if data.startswith(_JPEG_MAGIC):
+        if b"\xff\xd9" not in data[-64:]:  # its last marker; what is missing would be decoded as grey
+            raise ValueError(f"{path} is cut short at byte {len(data)}; copy it again")
+        image = _decoded(path, data, "JPEG")
+    else:
+        image = read_png(path)
+    if image.dtype != np.uint8:
+        raise ValueError(f"{path} has {image.dtype} samples; save it with 8 bits a channel")
+    return colour_to_rgb(image)
+
+
+def colour_to_rgb(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w 3"]:
+    """RGB from what OpenCV decodes: grey, BGR or BGRA."""
+    if image.ndim == 2 or image.shape[2] == 1:
+        return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)
+    return np.ascontiguousarray(image[:, :, 2::-1])
+
+
+def read_npy(path: Path) -> Shaped[np.ndarray, "..."]:
+    """The array in a .npy file. Raises `ValueError` for one that is damaged, too large, or holds Python objects."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is missing")
+    try:
+        values = np.load(path, allow_pickle=False, mmap_mode="r")
+    except (ValueError, OSError, EOFError, SyntaxError) as error:
+        raise ValueError(f"{path} is not a whole .npy file ({' '.join(str(error).split())}); save it again") from None
+    return _plain(str(path), values)
+
+
+def read_npz(path: Path, names: Sequence[str]) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """Those arrays of a .npz file whose names are among `names`, whatever their case. Raises as `read_npy`."""
+    wanted = {name.lower() for name in names}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for info in archive.infolist():
+                if info.filename.removesuffix(".npy").lower() in wanted and info.file_size > 8 * LARGEST:
+                    raise ValueError(f"{path}: {info.filename} unpacks to {info.file_size >> 20} MB; give one frame")
+        with np.load(path, allow_pickle=False) as arrays:
+            chosen = [name for name in arrays.files if name.lower() in wanted]
+            return {name.lower(): _plain(f"{path}: {name}", arrays[name]) for name in chosen}
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, SyntaxError) as error:
+        if isinstance(error, FileNotFoundError):
+            raise FileNotFoundError(f"{path} is missing") from None
+        raise ValueError(f"{path} is not a whole .npz file ({' '.join(str(error).split())}); save it again") from None
+
+
+def _plain(name: str, values: Shaped[np.ndarray, "..."]) -> Shaped[np.ndarray, "..."]:
+    if values.size > LARGEST:
+        raise ValueError(f"{name} has {values.size} values; give one frame")
+    if values.dtype.kind not in "biuf":
+        raise ValueError(f"{name} holds {values.dtype}; save numbers")
+    return np.array(values)
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        raise FileNotFoundError(f"{path} is missing; a frame folder holds color.png, depth.png and meta.json") from None
+
+
+def _decoded(path: Path, data: bytes, kind: str) -> Shaped[np.ndarray, "h w *c"]:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise ValueError(f"{path} cannot be decoded; save it again as {kind}")
+    return image
