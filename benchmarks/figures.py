@@ -20,7 +20,7 @@ PAGE = ROOT / "docs" / "figures.md"
 ORDER = {
     "The prior": ("prior",),
     "Unseen space": ("calibration", "handle", "hidden"),
-    "A real frame": ("frame",),
+    "Real frames": ("real", "segmentation"),
     "Strangers": ("out_of_model", "strangers", "kinds"),
     "The sampler alone": ("sbc", "chains", "acceptance"),
     "What it is worth to a planner": ("reach", "query", "next_view"),

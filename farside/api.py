@@ -23,7 +23,7 @@ from perception.inference.controller import estimate as estimate_object
 from perception.inference.scene import estimate_each
 from perception.inference.settings import ControllerConfig
 from perception.inference.tracker import Tracker
-from perception.observation.segmentation import Segment, segment
+from perception.observation.segmentation import Segment, Segments, segment
 from perception.observation.settings import SegmentConfig
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import write_frame_folder
@@ -47,6 +47,7 @@ __all__ = [
     "Scene",
     "Segment",
     "SegmentConfig",
+    "Segments",
     "StageInfo",
     "Swept",
     "Tracker",
@@ -116,7 +117,8 @@ def estimate(
             frame, found, weights, config, seed=seed, budget_s=budget, stages=stages, on_stage=on_stage
         )
 
-    done, left_out = [], {}
+    left_out = {it.id: it.reason for it in segments.left_out} if isinstance(segments, Segments) else {}
+    done = []
     complaint = ValueError("there is no segment to infer; give at least one")
     for found, result in estimate_each(segments, estimate_one, None if budget_s is None else begun + budget_s):
         if isinstance(result, ValueError):

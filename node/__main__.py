@@ -24,13 +24,14 @@ from node.commands.options import (
     Query,
     Record,
     ReplayConfig,
+    Segmenting,
     View,
     options_of,
 )
 from node.commands.training_options import NetworkTraining, Training
 from probnerf.environment import prepare
 
-Config = TypeVar("Config", ReplayConfig, LiveConfig)
+Config = TypeVar("Config", ReplayConfig, Segmenting, LiveConfig)
 
 DESCRIPTION = """Farside: from one partial RGB-D view of an object, several whole, weighted shapes, and the probability
 that any space the camera cannot see is occupied. Lengths are in metres. --version prints the version; with --debug an
@@ -39,6 +40,7 @@ error shows its traceback."""
 BENCH = "Run a study: print its table, draw its picture, and write its rows as JSON. Needs a checkout."
 SUMMARIES = {
     "replay": str(ReplayConfig.__doc__),
+    "segment": str(Segmenting.__doc__),
     "live": str(LiveConfig.__doc__),
     "record": str(Record.__doc__),
     "query": str(Query.__doc__),
@@ -76,6 +78,14 @@ def _replay(args: Sequence[str]) -> int:
     if config.schedule:
         from node.commands.replay_schedule import follow as run
     return 0 if run(config, Console(), Console(stderr=True)) else 130
+
+
+def _segment(args: Sequence[str]) -> int:
+    config = _configured(Segmenting, "farside segment", args)
+    from node.commands.segment import segment_frame
+
+    segment_frame(config, Console(), Console(stderr=True))
+    return 0
 
 
 def _live(args: Sequence[str]) -> int:
@@ -188,6 +198,7 @@ def _documented(name: str, text: str) -> Callable[[], None]:
 
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "replay": _replay,
+    "segment": _segment,
     "live": _live,
     "record": _record,
     "query": _query,

@@ -39,7 +39,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("coverage",),
     ),
     "probnerf": (
-        ("environment", "geometry", "settings", "types"),
+        ("environment", "geometry", "pixel_status", "settings", "types"),
         ("kernel",),
         ("compile_cache", "fields"),
         ("rendering",),
@@ -79,7 +79,8 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "optax": ("probnerf/sampling/*", "probnerf/training/elbo.py", "probnerf/training/posterior_flow.py"),
     "safetensors": ("probnerf/prior/checkpoint.py",),
     "blackjax": (),  # an independent sampler to test against
-    "cv2": ("calibration/*", "perception/*", "probnerf/training/srn_dataset.py"),  # the last: PNG files, resized
+    # pictures in a second, before matplotlib is imported; PNG files, resized
+    "cv2": ("calibration/*", "perception/*", "node/*/segment*.py", "probnerf/training/srn_dataset.py"),
     "scipy": (
         "node/ros/messages.py",
         "probnerf/objects/household_parts.py",  # splines

@@ -4,7 +4,6 @@ import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -12,8 +11,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from calibration.camera import Camera
-from calibration.camera_file import read_camera
+from node.commands.frame import read_frame, segments_of
 from node.commands.options import ReplayConfig
 from node.figures.object_figure import draw_object
 from node.figures.summary import answer, diagnostics, figures, warnings
@@ -23,13 +21,10 @@ from perception.answers.summary import summarise
 from perception.inference.controller import Estimate, estimate
 from perception.inference.scene import estimate_each
 from perception.inference.settings import ControllerConfig
-from perception.observation.segmentation import Segment, segment
-from perception.observation.settings import SegmentConfig
+from perception.observation.segmentation import Segment
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import write_frame_folder
-from perception.sources.playback import frame_at
 from perception.sources.settings import SHIPPED_LOG
-from perception.sources.topic_names import TopicNames
 from probnerf.prior.checkpoint import Prior, load_prior
 from probnerf.sampling.hmc import StageInfo
 from probnerf.types import StopReason
@@ -48,15 +43,8 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
     if config.folder.exists() and not config.folder.is_dir():
         raise ValueError(f"{config.folder} is a file; give a folder for the results with --out")
     prior = load_prior(config.prior)
-    camera = None if config.camera is None else read_camera(config.camera)
-    frame = read_frame(config.source, config.frame, err, config.start_s, config.end_s, camera, config.topics)
-    if config.colour_only:
-        frame = replace(frame, depth=None)
-    segmentation, source = _segmentation(frame, config), config.source or SHIPPED_LOG
-    try:
-        segments = segment(frame, config.object, segmentation)
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from None
+    frame = read_frame(config, err)
+    segments, source = segments_of(config, frame, err), config.source or SHIPPED_LOG
     limit = config.budget or (None if config.stages else BUDGET_S)
     kept, done = frame_path(config.folder), list[Hypotheses]()
     is_source = config.source is not None and config.source.resolve() == kept.resolve()
@@ -86,36 +74,6 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
     if not done:
         raise complaint
     return True
-
-
-def _segmentation(frame: Frame, config: ReplayConfig) -> SegmentConfig:
-    """How objects are found, with the user's box. Raises `ValueError` if the frame has depth, which makes a box
-    useless.
-    """
-    if config.box is None:
-        return config.segment
-    if frame.depth is not None:
-        raise ValueError("the frame has depth, which finds its objects: omit --box, or add --colour-only")
-    return replace(config.segment, mask=replace(config.segment.mask, box_px=config.box))
-
-
-def read_frame(
-    source: Path | None,
-    index: int,
-    err: Console,
-    start_s: float = 0.0,
-    end_s: float | None = None,
-    camera: Camera | None = None,
-    topics: TopicNames | None = None,
-) -> Frame:
-    """Frame `index` (-1: the last) of a source, or of a recording's range. `camera` and `topics` replace its own.
-
-    Its notes go to `err`. Raises ValueError if there is no such frame.
-    """
-    frame, notes = frame_at(source, index, start_s, end_s, camera, topics)
-    for note in notes:
-        err.print(f"note: {note}", highlight=False, soft_wrap=True)
-    return frame
 
 
 def infer(

@@ -89,7 +89,7 @@ def _looks(
     how = {entry.object_id: (entry.seed, entry.started_from == "fresh") for entry in scheduled}
     looks = {}
     try:
-        segments = segment(frame, None, config.segment)
+        segments = segment(frame, None, config.segmentation)
     except ValueError as error:
         err.print(f"frame at {frame.stamp_ns} ns is left out: {error}", highlight=False, soft_wrap=True)
         return {}
@@ -106,8 +106,8 @@ def _looks(
 
 def _check(path: Path, entries: Sequence[Scheduled], prior: Prior, config: ReplayConfig) -> None:
     """Raises ValueError if another prior or configuration was recorded."""
-    current = config_hash(config.inference, config.segment, config.track)
-    without_track = config_hash(config.inference, config.segment)  # what Farside before 0.2.0 recorded
+    current = config_hash(config.inference, config.segmentation, config.track)
+    without_track = config_hash(config.inference, config.segmentation)  # what Farside before 0.2.0 recorded
     for entry in entries:
         if entry.prior_hash != prior.identity:
             raise ValueError(

@@ -4,6 +4,7 @@ With depth the plane is measured. Without, it is supposed (`PlaneGuess`) and col
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import overload
 
@@ -92,18 +93,18 @@ def _segment_depth(frame: Frame, object_id: int | None, config: SegmentConfig) -
     if not np.isfinite(frame.depth).any():
         raise ValueError(f"no pixel of {frame.depth.size} has depth; check the depth sensor")
     points, label = backproject(frame), frame.label
-    left = list[LeftOut]()
+    supports, left = _supports(points, frame, config), list[LeftOut]()
     if config.mask.box_px is not None:
-        thing, label = in_box(points, config.mask.box_px, config), None
+        thing, label = in_box(points, config.mask.box_px, supports, config), None
         found = {1: (thing.mask, thing.plane)}
     elif label is not None:
         ids = [int(i) for i in np.unique(label) if i > 0]
         if not ids:
             raise ValueError("the label map names no object; give one with ids from 1, or none")
-        plane = support_of(points, label, candidates(points, config), config.plane)
+        plane = support_of(points, label, supports, config.plane)
         found = {i: (label == i, plane) for i in ids}
     else:
-        stands = standing(points, frame.camera, config)
+        stands = standing(points, frame.camera, supports, config)
         found = {i: (thing.mask, thing.plane) for i, thing in enumerate(stands.things, start=1)}
         left = [LeftOut(i, *it) for i, it in enumerate(stands.left_out, start=len(found) + 1)]
         if not found:
@@ -127,6 +128,20 @@ def _segment_depth(frame: Frame, object_id: int | None, config: SegmentConfig) -
     if not segments:
         raise ValueError(f"no object has {config.min_pixels} pixels of depth; move the camera nearer")
     return Segments(tuple(segments), tuple(left))
+
+
+def _supports(points: Float[np.ndarray, "h w 3"], frame: Frame, config: SegmentConfig) -> list[Float[np.ndarray, "4"]]:
+    """The planes of a frame; without one the supposed plane of the camera's pose or height.
+
+    With a label map those that are seen beside its objects, whose faces are planes, too.
+    """
+    beside = points if frame.label is None else np.where(frame.label[..., None] > 0, np.nan, points)
+    try:
+        return candidates(beside, config)
+    except ValueError:
+        with suppress(ValueError):
+            return [supposed_plane(frame, config.guess)]
+    return candidates(points, config)
 
 
 def _nothing(left: Sequence[LeftOut], depth: Float[np.ndarray, "h w"]) -> str:

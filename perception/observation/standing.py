@@ -1,6 +1,6 @@
 """The things that stand in a frame without a label map, and what they stand on."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -61,18 +61,22 @@ def candidates(points: Float[np.ndarray, "h w 3"], config: SegmentConfig) -> lis
     if not found:
         raise ValueError(
             "no support plane was found; show more of the table, check the depth and its unit, or give the plane"
-            " (--plane)"
+            " (--plane) or the camera's pose"
         )
     return found
 
 
-def standing(points: Float[np.ndarray, "h w 3"], camera: Camera, config: SegmentConfig) -> Standing:
-    """The things that stand on a frame's supports (`points` of its pixels in the camera frame, m).
+def standing(
+    points: Float[np.ndarray, "h w 3"],
+    camera: Camera,
+    supports: Sequence[Float[np.ndarray, "4"]],
+    config: SegmentConfig,
+) -> Standing:
+    """The things that stand on the supports of a frame (`points` of its pixels in the camera frame, m).
 
     The first support is the plane that carries most: pixels of clusters of an object's size that reach down to it. A
-    plane parallel to it that carries nearly as much (`also`) is one, too. Raises `ValueError` if there is none.
+    plane parallel to it that carries nearly as much (`also`) is one, too. `supports`: at least one (`candidates`).
     """
-    supports = candidates(points, config)
     carried = [_carried(points[::2, ::2], plane, config) * upward(plane) for plane in supports]
     order = sorted(range(len(supports)), key=lambda i: -carried[i])
     first = supports[order[0]]
@@ -98,7 +102,12 @@ def standing(points: Float[np.ndarray, "h w 3"], camera: Camera, config: Segment
     return found
 
 
-def in_box(points: Float[np.ndarray, "h w 3"], box_px: tuple[int, int, int, int], config: SegmentConfig) -> Thing:
+def in_box(
+    points: Float[np.ndarray, "h w 3"],
+    box_px: tuple[int, int, int, int],
+    supports: Sequence[Float[np.ndarray, "4"]],
+    config: SegmentConfig,
+) -> Thing:
     """The one thing in a box (x0 y0 x1 y1, px; ends exclusive). Raises `ValueError` if there is nothing."""
     x0, y0, x1, y1 = box_px
     height, width = points.shape[:2]
@@ -110,7 +119,7 @@ def in_box(points: Float[np.ndarray, "h w 3"], box_px: tuple[int, int, int, int]
     outside = np.ones((height, width), bool)
     outside[y0:y1, x0:x1] = False
     best, most = None, 0
-    for plane in candidates(points, config):
+    for plane in supports:
         mask = np.zeros((height, width), bool)
         for pixels, cloud in _clusters(points, plane, config, 1, outside):
             low = np.percentile(heights(cloud, plane), 5) < _FOOT * np.median(noise_growth(cloud))

@@ -6,7 +6,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float
 
 from calibration.camera import Camera
 from foundation.whole_file import write_whole
@@ -119,7 +119,7 @@ def write_frame_folder(path: Path | str, frame: Frame) -> None:
     if frame.T_world_camera is not None:
         meta["T_world_camera"] = np.asarray(frame.T_world_camera, np.float64).tolist()
     path.mkdir(parents=True, exist_ok=True)
-    for name in ("meta.json", *images):
+    for name in ("meta.json", *images, *COLOURS, "depth.npy", "label.npy", "label.npz"):
         (path / name).unlink(missing_ok=True)
     for name, image in images.items():
         if image is not None:
@@ -143,7 +143,11 @@ def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
     if "depth_unit_m" in meta and not (number and 0 < unit <= 1):
         raise ValueError(f"{path}: depth_unit_m is {unit!r}; give metres per count, such as 0.001")
     optional = {"distortion": [0.0] * 5, "distortion_model": "plumb_bob", "stamp_ns": 0, "frame_id": "camera"}
-    meta = {**optional, **dict.fromkeys(("T_world_camera", "T_color_depth", "depth_camera_matrix_px", *_DEVIATIONS)), **meta}
+    meta = {
+        **optional,
+        **dict.fromkeys(("T_world_camera", "T_color_depth", "depth_camera_matrix_px", *_DEVIATIONS)),
+        **meta,
+    }
     for key, default in optional.items():
         if isinstance(meta[key], bool) or not isinstance(meta[key], type(default)):
             raise ValueError(f"{path}: {key} is {meta[key]!r}; give something like {default!r}, or omit it")

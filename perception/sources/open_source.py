@@ -22,9 +22,9 @@ def open_source(path: Path | str | None, camera: Camera | None = None, topics: T
     """The source that `path` names; None is the log shipped with the project.
 
     `oak` or `oak:ID` is an OAK camera, `webcam:N` the camera /dev/videoN; else a video file (by its suffix), a frame
-    folder (it holds color.png), a .npz file with a frame, or a log. For a file of such a name write ./oak. `camera` is the calibration for a
-    webcam or a video file, or replaces that of an OAK camera, a log or a frame folder. It must have the size of the
-    images. `topics` replace the topics that `Log` finds in a log.
+    folder (it holds color.png), a .npz file with a frame, or a log. For a file of such a name write ./oak. `camera` is
+    the calibration for a webcam or a video file, or replaces that of an OAK camera, a log or a frame folder. It must
+    have the size of the images. `topics` replace the topics that `Log` finds in a log.
 
     Raises `FileNotFoundError`, `OSError` or `ValueError` with one line that names file or device and the remedy.
     """

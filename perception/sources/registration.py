@@ -29,11 +29,9 @@ def registered(
     found = np.full(camera.height * camera.width, np.inf, np.float32)
     for dy in range(-reach, reach + 1):
         for dx in range(-reach, reach + 1):
-            at = np.rint(pixels).astype(np.int64) + [dx, dy]
+            at = np.rint(pixels).astype(np.int64) + np.array([dx, dy])
             inside = (np.abs(at - pixels) <= 0.5 * width + 1e-6).all(axis=1)
             inside &= ((at >= 0) & (at < [camera.width, camera.height])).all(axis=1)
-            np.minimum.at(
-                found, at[inside, 1] * camera.width + at[inside, 0], points[inside, 2].astype(np.float32)
-            )
+            np.minimum.at(found, at[inside, 1] * camera.width + at[inside, 0], points[inside, 2].astype(np.float32))
     found[~np.isfinite(found)] = np.nan
     return found.reshape(camera.height, camera.width)

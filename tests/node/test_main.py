@@ -182,7 +182,7 @@ def _spoil(folder: Path, what: str, frame: Frame) -> None:
     ("what", "says"),
     [
         ("truncated colour", r"color\.png is cut short at byte 500; copy it again"),
-        ("other size", r"depth\.png is 120x90 px but color\.png is 240x180; align"),
+        ("other size", r"depth\.png is 120x90 px but the colour is 240x180; align"),
         ("no depth", r"no pixel of 43200 has depth; check the depth sensor"),
         ("tiny mask", r"object 1 has 9 pixels, .* at least 50 are needed: move the camera nearer"),
         ("too large", r"object 1 measures .* cm across and .* tabletop objects are .*: give another object"),
@@ -210,7 +210,7 @@ def test_a_bad_frame_folder_is_named(
     ("arguments", "says"),
     [
         (["replay", "nowhere"], "nowhere does not exist; give oak"),
-        (["replay", "{table}", "--object", "12"], "has no object 12; its objects: 1, 2"),
+        (["replay", "{table}", "--object", "12"], "no object 12; its objects: 1, 2"),
         (["replay", "{table}", "--budget", "0"], "the budget is 0 s; give more than 0"),
         (["replay", "{table}", "--stages", "0"], "stages is 0; give 1 or more"),
         (["replay", "{table}", "--out", "{text}"], "notes.txt is a file; give a folder"),

@@ -9,6 +9,7 @@ from perception.sources.frame import Frame
 
 CAMERA = Camera(320, 240, np.array([[310.0, 0.0, 159.5], [0.0, 310.0, 119.5], [0.0, 0.0, 1.0]]), np.zeros(5))
 TABLE_RADIUS, FLOOR, WALL = 0.45, -0.7, 1.6  # m
+WALL_THICKNESS = 0.003  # m
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,7 @@ class Cylinder:
     radius: float
     height: float
     base: float = 0.0
+    is_open: bool = False  # a cup: a wall and a floor, WALL_THICKNESS each
 
 
 CAN = Cylinder(0.0, 0.0, 0.045, 0.12)
@@ -59,16 +61,28 @@ def picture(
             side = (-b - np.sqrt(b * b - a * ((p[:2] ** 2).sum() - thing.radius**2))) / a
             z = p[2] + side * d[:, 2]
             side[~((side > 0) & (z >= 0) & (z <= thing.height))] = np.inf
-            top = (thing.height - p[2]) / d[:, 2]
-            top[~((top > 0) & (np.linalg.norm((p + top[:, None] * d)[:, :2], axis=1) <= thing.radius))] = np.inf
-            hit = np.minimum(side, top)
+            hollow = thing.radius - WALL_THICKNESS if thing.is_open else 0.0
+
+            def level(z: float, least: float, most: float, p: np.ndarray = p) -> np.ndarray:
+                t = (z - p[2]) / d[:, 2]
+                radius = np.linalg.norm((p + t[:, None] * d)[:, :2], axis=1)
+                return np.where((t > 0) & (radius >= least) & (radius <= most), t, np.inf)
+
+            hit = np.minimum(side, level(thing.height, hollow, thing.radius))
+            if thing.is_open:
+                inner = (-b + np.sqrt(b * b - a * ((p[:2] ** 2).sum() - hollow**2))) / a
+                z = p[2] + inner * d[:, 2]
+                inner[~((inner > 0) & (z >= WALL_THICKNESS) & (z <= thing.height))] = np.inf
+                hit = np.minimum(hit, np.minimum(inner, level(WALL_THICKNESS, 0.0, hollow)))
             ids[hit < best] = i
             best = np.minimum(best, hit)
     depth = best * rays[:, 2]
     rng = np.random.default_rng(0)
     depth = depth + noise * (1e-3 + 2e-3 * depth**2) * rng.normal(size=depth.shape)
     depth[rng.random(depth.shape) < 0.01 * (noise > 0)] = np.nan
-    colours = np.array([[200, 190, 170], [220, 40, 30], [30, 60, 220], [40, 180, 60]], np.uint8)
+    colours = np.array(
+        [[200, 190, 170], [220, 40, 30], [30, 60, 220], [40, 180, 60], [250, 240, 60], [90, 30, 120]], np.uint8
+    )
     shape = (camera.height, camera.width)
     return Frame(
         colours[ids].reshape(*shape, 3),

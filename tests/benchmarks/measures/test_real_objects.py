@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from benchmarks.studies.frame import DATA, OBJECTS, TrueObject, free_points, is_hidden, outward_normals, read_truth
+from benchmarks.measures.real_objects import free_points, hidden_surface, is_hidden, near_points, outward_normals
+from benchmarks.scenes.real_frames import DATA, FRAMES, TrueObject, read_truth
 from perception.observation.segmentation import segment
 from perception.observation.support_plane import heights
 from perception.sources.frame_folder import read_frame_folder
@@ -26,11 +27,27 @@ def test_a_box_turns_with_its_object():
 
 
 def test_free_points_of_the_real_frame_are_free_and_unseen(shared_data):
-    frame, truth = read_frame_folder(DATA), read_truth(DATA)
+    folder = DATA / "ycbv_000002"
+    frame, truth = read_frame_folder(folder), read_truth(folder)
     plane = segment(frame, 1)[0].plane
     points = free_points(frame, plane, truth, 1)
-    assert len(points) > 500 and set(truth) == set(OBJECTS)
+    assert len(points) > 500 and set(truth) == set(FRAMES["ycbv 000002"].things)
     assert (heights(points, plane) > 0).all() and is_hidden(frame, points).all()
     for other in truth.values():
         assert not other.box_holds(points, 0.0).any()
         assert np.linalg.norm(points[::50, None] - other.in_camera[None], axis=-1).min() >= 0.015
+
+
+def test_points_near_the_hidden_surface_are_outside_of_it(shared_data):
+    folder = DATA / "ycbv_000002"
+    frame, truth = read_frame_folder(folder), read_truth(folder)
+    plane, surface = segment(frame, 1)[0].plane, truth[1].in_camera
+    near = near_points(frame, plane, truth, 1)
+    gap = np.linalg.norm(near[::20, None] - surface[None], axis=-1).min(axis=1)
+    assert len(near) > 100 and gap.min() > 0.003 and gap.max() < 0.016
+    middle = surface.mean(axis=0)
+    farther = (
+        np.linalg.norm(near - middle, axis=1).mean()
+        - np.linalg.norm(hidden_surface(frame, truth[1]) - middle, axis=1).mean()
+    )
+    assert 0.004 < farther < 0.016
