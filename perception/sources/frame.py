@@ -51,12 +51,6 @@ class Frame:
                 f"the camera is calibrated at {camera.width}x{camera.height} px but colour is"
                 f" {width}x{height} px; use the calibration of this image size"
             )
-        cx, cy = camera.K[0, 2], camera.K[1, 2]
-        if not (0 <= cx <= width and 0 <= cy <= height):
-            raise ValueError(
-                f"the camera's principal point ({cx:.0f}, {cy:.0f}) is outside of the picture of {width}x{height} px:"
-                " its matrix is of another resolution; scale it to this one, or calibrate at this size"
-            )
         if depth is not None:  # a sensor's zero or infinity is no distance
             depth = _plane("depth", depth, np.float32, rgb)
             _check_metres(depth)

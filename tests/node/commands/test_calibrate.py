@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-import node.commands.replay
+import node.commands.frame
 from calibration.boards import parse_board
 from calibration.calibrate import CalibrateConfig, calibrate
 from calibration.camera_file import read_camera, write_camera
@@ -246,7 +246,7 @@ def test_replay_takes_a_calibration(
         np.testing.assert_array_equal(frame.camera.K_std, K_std)
         raise ValueError("reached")
 
-    monkeypatch.setattr(node.commands.replay, "segment", reached)
+    monkeypatch.setattr(node.commands.frame, "segment", reached)
     for name, says in (
         ("right.yaml", "shipped.mcap: reached"),
         ("small.yaml", "the camera is calibrated at 64x48 px but colour is 640x480"),

@@ -30,7 +30,7 @@ controller:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--box", "1", "2", "30", "40"], "the frame has depth, which finds its objects: omit --box"),
+        (["--box", "1", "2", "30", "40"], "nothing that stands on a plane is whole in the box 1 2 30 40"),
         (["--colour-only"], "give camera_height (m) and tilt"),
         (["--colour-only", "--box", "1", "2", "300", "40"], "leaves the picture of 240x180 px"),
         (["--colour-only", "--object", "9"], "no object 9"),

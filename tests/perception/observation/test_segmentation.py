@@ -204,3 +204,10 @@ def test_the_real_frame(shared_data: Path) -> None:
 def test_a_length_that_is_none_is_named(change: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(change))} is .*; give 0 or more"):
         SegmentConfig(**change)
+
+
+def test_intrinsics_of_another_resolution_are_named() -> None:
+    frame = picture(CAN)
+    wrong = replace(frame, camera=replace(frame.camera, K=frame.camera.K * [[3.0], [3.0], [1.0]]))
+    with pytest.raises(ValueError, match=r"principal point .* is outside .* of another resolution"):
+        segment(wrong)

@@ -1,7 +1,6 @@
 """Frames as people have them: JPEG, .npy and .npz, depth of another camera, label maps of segmenters."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -156,8 +155,3 @@ def test_depth_of_another_size_needs_its_camera(folder: Path, frame: Frame) -> N
     found = read_frame_folder(folder).depth
     close = np.abs(found - frame.depth)[100:200, 100:200]
     assert found.shape == frame.depth.shape and np.nanmedian(close) < 0.004
-
-
-def test_intrinsics_of_another_resolution_are_named(frame: Frame) -> None:
-    with pytest.raises(ValueError, match=r"principal point .* is outside .* of another resolution"):
-        replace(frame, camera=Camera(320, 240, CAMERA.K * [[3.0], [3.0], [1.0]], np.zeros(5)))
