@@ -18,9 +18,10 @@ from perception.answers.query import QueryResult
 from perception.answers.query import query as ask
 from perception.answers.regions import Box, Cells, Points, Region, Swept, read_mesh
 from perception.answers.scene import Scene
-from perception.inference.controller import Estimate
-from perception.inference.controller import estimate as estimate_object
-from perception.inference.scene import estimate_each
+from perception.inference.controller import inference_of
+from perception.inference.inference import Inference
+from perception.inference.limits import Callbacks, Limits
+from perception.inference.scene import estimate_scene
 from perception.inference.settings import ControllerConfig
 from perception.inference.tracker import Tracker
 from perception.observation.segmentation import Segment, Segments, segment
@@ -111,23 +112,22 @@ def estimate(
         )
     weights = load_prior() if prior is None else prior
 
-    def estimate_one(found: Segment, budget: float | None) -> Estimate:
+    def start(found: Segment, deadline: float | None) -> Inference:
         on_stage = None if on_progress is None else partial(on_progress, found.id)
-        return estimate_object(
-            frame, found, weights, config, seed=seed, budget_s=budget, stages=stages, on_stage=on_stage
-        )
+        limits, callbacks = Limits(deadline, stages), Callbacks(on_stage)
+        return inference_of(frame, found, weights, config, seed=seed, limits=limits, callbacks=callbacks)
 
     left_out = {it.id: it.reason for it in segments.left_out} if isinstance(segments, Segments) else {}
     done = []
     complaint = ValueError("there is no segment to infer; give at least one")
-    for found, result in estimate_each(segments, estimate_one, None if budget_s is None else begun + budget_s):
+    for found, result in estimate_scene(segments, start, None if budget_s is None else begun + budget_s):
         if isinstance(result, ValueError):
             left_out[found.id], complaint = str(result), result
         else:
             done.append(result.hypotheses)
     if not done:
         raise complaint
-    return Scene(tuple(done), left_out)
+    return Scene(tuple(sorted(done, key=lambda h: h.object_id)), left_out)
 
 
 def query(scene: Objects, region: Region, frame: FrameName = "camera", now_ns: int | None = None) -> QueryResult:

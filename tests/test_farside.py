@@ -12,6 +12,7 @@ import farside
 from farside import api
 from perception.answers.query import query
 from tests.node.mugs import mug_hypotheses, table_frame
+from tests.node.pretend_inference import Asked
 
 BOX = farside.Box((-0.02, -0.02, 0.0), (0.02, 0.02, 0.05))
 
@@ -75,13 +76,14 @@ def test_estimate_tells_its_progress_and_names_what_it_leaves_out(
 ) -> None:
     calls: list[int] = []
 
-    def stand_in(frame, segment, prior, config, *, seed, budget_s, stages, on_stage):
-        if segment.id == 1:
-            raise ValueError("object 1 measures 90 cm")
-        on_stage(farside.StageInfo)
-        return type("Estimate", (), {"hypotheses": mug_hypotheses(frame, segment, [1.0], [1.0], 16)})
+    class StandIn(Asked):
+        def __call__(self, frame, found, prior, config, **asked):
+            if found.id == 1:
+                raise ValueError("object 1 measures 90 cm")
+            asked["callbacks"].on_stage(farside.StageInfo)
+            return super().__call__(frame, found, prior, farside.ControllerConfig(), **asked)
 
-    monkeypatch.setattr(api, "estimate_object", stand_in)
+    monkeypatch.setattr(api, "inference_of", StandIn())
     both = [farside.segment(frame, 1)[0]] * 2
     object.__setattr__(second := farside.Segment(**vars(both[1])), "id", 2)
     scene = farside.estimate(frame, [both[0], second], prior=object(), on_progress=lambda i, info: calls.append(i))

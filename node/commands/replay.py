@@ -2,31 +2,31 @@
 
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from node.commands.frame import read_frame, segments_of
 from node.commands.options import ReplayConfig
+from node.commands.progress import InferenceProgress
 from node.figures.object_figure import draw_object
 from node.figures.summary import answer, diagnostics, figures, warnings
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.hypotheses_file import frame_path, hypotheses_path, load, save
 from perception.answers.summary import summarise
-from perception.inference.controller import Estimate, estimate
-from perception.inference.scene import estimate_each
-from perception.inference.settings import ControllerConfig
+from perception.inference.controller import inference_of
+from perception.inference.inference import Inference
+from perception.inference.limits import Callbacks, Limits
+from perception.inference.scene import Answered, estimate_scene
 from perception.observation.segmentation import Segment
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import write_frame_folder
 from perception.sources.settings import SHIPPED_LOG
-from probnerf.prior.checkpoint import Prior, load_prior
-from probnerf.sampling.hmc import StageInfo
+from probnerf.prior.checkpoint import load_prior
 from probnerf.types import StopReason
 
 BUDGET_S = 90.0
@@ -50,68 +50,51 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
     is_source = config.source is not None and config.source.resolve() == kept.resolve()
     complaint = ValueError("no object")
 
-    def infer_one(found: Segment, budget: float | None) -> Estimate:
-        return infer(frame, found, prior, config.inference, err, config.seed, config.stages, budget)
-
     deadline = None if limit is None else begun + limit
-    for found, result in estimate_each(segments, infer_one, deadline, PICTURE_S):
-        if isinstance(result, ValueError):
-            if len(segments) > 1:
-                err.print(f"object {found.id} is left out: {result}", highlight=False, soft_wrap=True)
-            complaint = ValueError(f"{source}: {result}")
-            continue
-        if not done and not is_source:
-            (kept / "meta.json").unlink(missing_ok=True)  # an older frame must not stay beside new objects
-        log = (f"started at {result.start}", *result.log)
-        path = publish(config.folder, frame, found, result.hypotheses, result.seconds, out, log)
-        if not done:
-            _clear_others(config.folder, path, result.hypotheses if config.object is not None else None, out)
-            if not is_source:
-                write_frame_folder(kept, frame)
-        done.append(result.hypotheses)
-        if result.hypotheses.result == StopReason.INTERRUPTED:
-            return False
+
+    def start(found: Segment, end: float | None) -> Inference:
+        limits, callbacks = Limits(end, config.stages), Callbacks(partial(progress.on_stage, found.id))
+        return inference_of(frame, found, prior, config.inference, seed=config.seed, limits=limits, callbacks=callbacks)
+
+    written = set[Path]()
+    with InferenceProgress([found.id for found in segments], config.stages, limit, err) as progress:
+        answered = estimate_scene(segments, start, deadline, PICTURE_S)
+        for found, result in _saved_if_interrupted(answered, config.folder, written):
+            progress.finished(found.id)
+            with progress.hidden():
+                if isinstance(result, ValueError):
+                    if len(segments) > 1:
+                        err.print(f"object {found.id} is left out: {result}", highlight=False, soft_wrap=True)
+                    complaint = ValueError(f"{source}: {result}")
+                    continue
+                if not done and not is_source:
+                    (kept / "meta.json").unlink(missing_ok=True)  # an older frame must not stay beside new objects
+                log = (f"started at {result.start}", *result.log)
+                written.add(publish(config.folder, frame, found, result.hypotheses, result.seconds, out, log))
+                if not done:
+                    one = result.hypotheses if config.object is not None else None
+                    _clear_others(config.folder, written, one, out)
+                    if not is_source:
+                        write_frame_folder(kept, frame)
+                done.append(result.hypotheses)
     if not done:
         raise complaint
-    return True
+    return all(h.result != StopReason.INTERRUPTED for h in done)
 
 
-def infer(
-    frame: Frame,
-    found: Segment,
-    prior: Prior,
-    controller: ControllerConfig,
-    err: Console,
-    seed: int,
-    stages: int | None,
-    budget: float | None = None,
-) -> Estimate:
-    """One object's estimate, its progress shown."""
-    with progress_of(f"object {found.id}", stages, budget, err) as on_stage:
-        return estimate(frame, found, prior, controller, seed=seed, budget_s=budget, stages=stages, on_stage=on_stage)
-
-
-@contextmanager
-def progress_of(
-    name: str, stages: int | None, budget: float | None, err: Console
-) -> Iterator[Callable[[StageInfo], None]]:
-    """A progress line: the stage, the temperature, and the sampler's acceptance."""
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=24), TimeElapsedColumn())
-    begun = time.monotonic()
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as progress:
-        task = progress.add_task(f"{name}: first, compiling" if budget is None or budget > 5 else name, total=1.0)
-
-        def on_stage(info: StageInfo) -> None:
-            beta, acceptance = min(info.beta), sum(info.acceptance) / len(info.acceptance)
-            parts = [0.0]
-            if stages is not None:
-                parts.append(info.stage / max(stages, 1))
-            if budget is not None:
-                parts.append((time.monotonic() - begun) / budget)
-            text = f"{name}: stage {info.stage}, temperature {1 / max(beta, 1e-9):.3g}, acceptance {acceptance:.2f}"
-            progress.update(task, description=text, completed=min(max(parts), 1.0))
-
-        yield on_stage
+def _saved_if_interrupted(answered: Iterator[Answered], folder: Path, written: set[Path]) -> Iterator[Answered]:
+    """The same; after a Ctrl-C all that follows is saved first, before anything is drawn, and added to `written`."""
+    for found, result in answered:
+        if not isinstance(result, ValueError) and result.hypotheses.result == StopReason.INTERRUPTED:
+            rest = [(found, result), *answered]
+            for other, estimate in rest:
+                if not isinstance(estimate, ValueError):
+                    path = hypotheses_path(folder, other.id)
+                    save(path, estimate.hypotheses)
+                    written.add(path)
+            yield from rest
+            return
+        yield found, result
 
 
 def publish(
@@ -134,12 +117,12 @@ def publish(
     return path
 
 
-def _clear_others(folder: Path, path: Path, same: Hypotheses | None, out: Console) -> None:
-    """Remove results of earlier runs beside `path`: a folder's objects must be of one frame. With `same` (one object
-    inferred) remove only those of other frames.
+def _clear_others(folder: Path, written: set[Path], same: Hypotheses | None, out: Console) -> None:
+    """Remove results of earlier runs beside those `written`: a folder's objects must be of one frame. With `same` (one
+    object inferred) remove only those of other frames.
     """
     for other in sorted(folder.glob("object_*.npz")):
-        if other == path or not re.fullmatch(r"object_\d+\.npz", other.name):
+        if other in written or not re.fullmatch(r"object_\d+\.npz", other.name):
             continue
         if same is not None and _is_of_frame(other, same):
             continue

@@ -1,13 +1,15 @@
 """`farside replay --schedule`: repeat the inferences of a recording, and compare the results."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
 
 from calibration.camera_file import read_camera
 from node.commands.options import ReplayConfig
-from node.commands.replay import progress_of, publish
+from node.commands.progress import InferenceProgress
+from node.commands.replay import publish
 from perception.inference.limits import Callbacks, Limits
 from perception.inference.schedule import config_hash, digest
 from perception.inference.tracker import Look, Tracker
@@ -57,8 +59,9 @@ def follow(config: ReplayConfig, out: Console, err: Console) -> bool:
             found, look = looks[entry.object_id]
             if entry not in wanted and frame.label is not None:
                 continue
-            with progress_of(f"object {entry.object_id}", entry.stages, None, err) as on_stage:
-                update = tracker.infer(look, Limits(stages=entry.stages), Callbacks(on_stage=on_stage))
+            with InferenceProgress([entry.object_id], entry.stages, None, err) as progress:
+                callbacks = Callbacks(partial(progress.on_stage, entry.object_id))
+                update = tracker.infer(look, Limits(stages=entry.stages), callbacks)
             if entry not in wanted:
                 continue
             folder = config.folder / str(frame.stamp_ns)

@@ -1,34 +1,77 @@
-"""All objects of a frame, one after the other, within one budget of time."""
+"""All objects of a frame, together, within one budget of time."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
 
-from perception.inference.controller import Estimate
+from perception.inference.inference import Estimate, Inference
 from perception.observation.segmentation import Segment
 from probnerf.types import StopReason
 
+Answered = tuple[Segment, Estimate | ValueError]
 
-def estimate_each(
+
+def estimate_scene(
     segments: Sequence[Segment],
-    estimate_one: Callable[[Segment, float | None], Estimate],
+    start: Callable[[Segment, float | None], Inference],
     deadline: float | None = None,
     kept_back_s: float = 0.0,
-) -> Iterator[tuple[Segment, Estimate | ValueError]]:
-    """Each segment's estimate, or the reason why there is none.
+) -> Iterator[Answered]:
+    """Each segment's estimate as soon as it is done, or the reason why there is none.
 
-    `estimate_one` gets a segment and its budget (s): its share of the time that is left until `deadline` (of
-    `time.monotonic`; None: no budget), less `kept_back_s` that the caller spends on each answer; at least a second. The
-    iteration ends after an answer that Ctrl-C cut short.
+    Without a `deadline` (of `time.monotonic`) one object is finished after the other. With one, all objects get their
+    first answers; then each a first run of the sampler, in its share of the time that is left; then the object whose
+    unseen space may gain most (`Inference.loss`) gets a run, as long as there is room. At the end every object has the
+    best answer that there was time for. `start` makes an inference that ends at a time. `kept_back_s` is what the
+    caller spends on each answer. After Ctrl-C all present answers are given.
     """
-    for i, segment in enumerate(segments):
-        budget = None
-        if deadline is not None:
-            budget = max((deadline - time.monotonic()) / (len(segments) - i) - kept_back_s, 1.0)
+    if deadline is not None and len(segments) > 1:
+        yield from _in_rounds(segments, start, deadline - kept_back_s * len(segments))
+        return
+    for segment in segments:
         try:
-            result = estimate_one(segment, budget)
+            inference = start(segment, None if deadline is None else max(deadline - kept_back_s, time.monotonic() + 1))
+            inference.begin()
         except ValueError as error:
             yield segment, error
             continue
-        yield segment, result
-        if result.hypotheses.result == StopReason.INTERRUPTED:
+        while not inference.done:
+            inference.step()
+        yield segment, inference.estimate()
+        if inference.interrupted:
             return
+
+
+def _in_rounds(
+    segments: Sequence[Segment], start: Callable[[Segment, float | None], Inference], end: float
+) -> Iterator[Answered]:
+    waiting = list[tuple[Segment, Inference]]()
+    for segment in segments:
+        try:
+            inference = start(segment, end)
+            inference.begin(guess=True)
+        except ValueError as error:
+            yield segment, error
+            continue
+        waiting.append((segment, inference))
+    interrupted = False
+    for i, (_, inference) in enumerate(waiting):
+        now = time.monotonic()
+        share = (end - now) / (len(waiting) - i)
+        if interrupted or inference.done or (share <= 0.0 and inference.answer is not None):
+            continue
+        inference.step(1, now + max(share, 1.0))
+        interrupted = inference.interrupted
+    while not interrupted and waiting:
+        for segment, inference in [pair for pair in waiting if pair[1].done]:
+            waiting.remove((segment, inference))
+            yield segment, inference.estimate()
+        if waiting and time.monotonic() < end:
+            chosen = max((inference for _, inference in waiting), key=lambda inference: inference.loss)
+            chosen.step(1)
+            interrupted = chosen.interrupted
+        else:
+            break
+    for segment, inference in waiting:
+        inference.stop(StopReason.INTERRUPTED if interrupted else StopReason.BUDGET)
+        if inference.answer is not None:
+            yield segment, inference.estimate()

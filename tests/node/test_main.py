@@ -2,6 +2,7 @@
 
 import json
 import re
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,14 +13,14 @@ import trimesh
 
 from node.__main__ import COMMANDS, main
 from perception.answers.hypotheses_file import load, load_scene, save
-from perception.inference.controller import Estimate
-from perception.observation.segmentation import Segment
+from perception.inference.limits import Limits
 from perception.sources.frame import Frame
 from perception.sources.recorder import write_log
-from probnerf.prior.checkpoint import Prior, save_prior
+from probnerf.prior.checkpoint import save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.types import StopReason
 from tests.node.mugs import MUG, mug_hypotheses, table_frame, write_folder
+from tests.node.pretend_inference import Asked
 
 BOX = ["--box", "-0.02", "-0.02", "0", "0.02", "0.02", "0.05"]
 
@@ -42,23 +43,10 @@ def folder(tmp_path: Path, frame: Frame) -> Path:
     return write_folder(tmp_path / "table", frame)
 
 
-class Asked:
-    """Stands for inference, after the real `observe`: keeps what it was asked, answers with the true mug."""
-
-    def __init__(self) -> None:
-        self.calls: list[dict] = []
-        self.result = StopReason.CONVERGED
-
-    def __call__(self, frame: Frame, found: Segment, prior: Prior, config: object, **asked) -> Estimate:
-        self.calls.append({"id": found.id, "prior": prior, "config": config, **asked})
-        h = mug_hypotheses(frame, found, [1.0, -1.0], [0.5, 0.5], 16, seed=asked["seed"], result=self.result)
-        return Estimate(h, None, None, None, h.object_frame, 1.5)
-
-
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
     stand_in = Asked()
-    monkeypatch.setattr("node.commands.replay.estimate", stand_in)
+    monkeypatch.setattr("node.commands.replay.inference_of", stand_in)
     monkeypatch.setattr("node.commands.replay.draw_object", lambda path, *_: path.touch())
     return stand_in
 
@@ -82,8 +70,8 @@ def test_replay_writes_a_file_and_a_picture_per_object(
         assert word in said
     assert str(out / "object_2.png") in said
     assert [h.object_id for h in load_scene(out)] == [1, 2]
-    first, second = (call["budget_s"] for call in asked.calls)
-    assert 35 < first < 50 and first < second < 100  # shared, less what the pictures take
+    first, second = (call["limits"].deadline - time.monotonic() for call in asked.calls)
+    assert 50 < first < 95 and first == pytest.approx(second, abs=0.1)  # one budget, less what the pictures take
     assert asked.calls[0]["prior"].model.preset.name == "tiny"
 
 
@@ -97,7 +85,7 @@ def test_options_win_over_the_file_and_reach_the_sampler(
     )
     assert main(["replay", "--config", str(config), "--stages", "4", "--controller.runs", "2"]) == 0
     (call,) = asked.calls
-    assert (call["id"], call["seed"], call["stages"], call["budget_s"]) == (2, 5, 4, None)
+    assert (call["id"], call["seed"], call["limits"]) == (2, 5, Limits(stages=4))
     assert (call["config"].hypotheses, call["config"].runs, call["config"].infer.method) == (9, 2, "annealed_hmc")
     assert load(tmp_path / "out" / "object_2.npz").seed == 5
 
@@ -134,8 +122,9 @@ def test_ctrl_c_keeps_what_is_there(folder: Path, tmp_path: Path, prior: Path, a
     asked.result = StopReason.INTERRUPTED
     out = tmp_path / "out"
     assert main(["replay", str(folder), "--prior", str(prior), "--out", str(out)]) == 130
-    assert sorted(p.name for p in out.iterdir()) == ["frame", "object_1.npz", "object_1.png"]
-    assert load(out / "object_1.npz").result == "interrupted"
+    files = ["frame", "object_1.npz", "object_1.png", "object_2.npz", "object_2.png"]
+    assert sorted(p.name for p in out.iterdir()) == files
+    assert {h.result for h in load_scene(out)} == {"interrupted"}
 
 
 def test_a_recording_gives_the_asked_frame(

@@ -23,7 +23,6 @@ from node.viewer.page_guard import HOST
 from node.viewer.scene3d import camera_view
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.hypotheses_file import load_scene, save
-from perception.inference.controller import Estimate
 from perception.observation.segmentation import segment
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import read_frame_folder, write_frame_folder
@@ -31,6 +30,7 @@ from probnerf.prior.checkpoint import save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from tests.node.browser import CHROMIUM, FLAGS, needs_browser
 from tests.node.mugs import mug_hypotheses, table_frame, write_folder
+from tests.node.pretend_inference import Asked
 
 
 @pytest.fixture(scope="module")
@@ -58,11 +58,7 @@ def test_replay_keeps_the_frame_it_used(
     """The folder's frame is that of its objects, whatever was there; a replay of that very folder leaves it."""
     monkeypatch.setattr(node.commands.replay, "draw_object", lambda path, *_: path.touch())
 
-    def answer(frame, found, prior, config, **asked) -> Estimate:
-        h = mug_hypotheses(frame, found, [1.0], [1.0], 16)
-        return Estimate(h, None, None, None, h.object_frame, 1.5)
-
-    monkeypatch.setattr(node.commands.replay, "estimate", answer)
+    monkeypatch.setattr(node.commands.replay, "inference_of", Asked())
     prior, out = tmp_path / "tiny.safetensors", tmp_path / "out"
     save_prior(prior, ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {})
     run = ["--prior", str(prior), "--out", str(out), "--stages", "1"]

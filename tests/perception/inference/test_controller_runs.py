@@ -43,8 +43,8 @@ class Sampler:
         monkeypatch.setattr("perception.inference.view_sampler.infer", self.infer)
         monkeypatch.setattr("perception.inference.view_sampler.crossings_of", lambda *_: 1)
         monkeypatch.setattr(ViewSampler, "likelihood", None)
-        monkeypatch.setattr("perception.inference.controller.pooled", self.pooled)
-        monkeypatch.setattr("perception.inference.controller.published", self.published)
+        monkeypatch.setattr("perception.inference.inference.pooled", self.pooled)
+        monkeypatch.setattr("perception.inference.inference.published", self.published)
 
     def infer(self, *_: Any, on_stage: Callable[[StageInfo], bool | None], **__: Any) -> tuple[Runs, None]:
         number = len(self.made)
