@@ -230,7 +230,8 @@ class Query:
     frame: Literal["object", "camera", "world"] = "object"
     """Frame of the question. object: z up, x to the camera, the plane under the origin; camera: x right, y down."""
     risk: float = 0.05
-    """Chance of being wrong at which it is still called free or occupied; else the verdict is "unsure"."""
+    """Chance of being wrong at which it is still called free or occupied; else the verdict is "unsure", or
+    "unseen" where nobody looked."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print JSON instead of a table."""
 

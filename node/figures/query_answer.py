@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from math import isnan
 
 from rich.console import Console
 from rich.table import Table
@@ -44,7 +45,7 @@ def rows(r: QueryResult) -> list[tuple[str, str]]:
     """The answer's names and values with units, in the order of reading."""
     v = {name: CM3 * value for name, value in r.volume_m3.items()}
     return [
-        ("all of it is free", f"{r.p_free:.3f} ± {r.p_free_se:.3f}"),
+        ("all of it is free", "not known" if isnan(r.p_free) else f"{r.p_free:.3f} ± {r.p_free_se:.3f}"),
         ("occupied volume", f"{v['q50']:.1f} cm³ (5 to 95%: {v['q05']:.1f} to {v['q95']:.1f})"),
         ("unseen", f"{100 * r.unseen_fraction:.0f}%"),
         (

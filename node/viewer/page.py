@@ -184,7 +184,7 @@ class Page:
             with self._server.atomic():
                 self._words.content = panel.answer(result, centre, size, self._placed.title)
                 self._odds.text = panel.odds(result)
-                self._body.color = panel.rgb(panel.paint(result.p_free))
+                self._body.color = panel.rgb(panel.paint(result))
 
     def _place_box(self) -> None:
         assert self._placed is not None and self._cloud is not None

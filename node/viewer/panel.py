@@ -41,6 +41,15 @@ _STOPPED = {
 }
 
 
+# what a verdict at the usual risk (`QueryResult.verdict`, as `farside query` gives it) means
+MEANING = {
+    "free": "all of the box is free, at a risk of 5%",
+    "occupied": "something is in the box, at a risk of 5%",
+    "unsure": "more than 5% chance of being wrong, or a part of the box that nobody looked at",
+    "unseen": "nobody looked there: no object's shapes were inferred in the box",
+}
+
+
 def box(inner: str, size: str = "13px") -> str:
     """A paragraph of the panel."""
     return f'<div style="padding:2px 12px;font-size:{size};line-height:1.45">{inner}</div>'
@@ -52,20 +61,21 @@ def answer(result: QueryResult, centre: Float[np.ndarray, "3"], size: Float[np.n
     cells = "".join(f"<tr><td {grey}>{escape(k)}</td><td>{escape(v)}</td></tr>" for k, v in rows(result)[1:])
     corners = " ".join(f"{v:.3f}" for v in (*(centre - 0.5 * size), *(centre + 0.5 * size)))
     return box(
-        f'<div style="font-size:22px;font-weight:600;color:{paint(result.p_free)}">{odds(result)}</div>'
-        f'<div style="color:#666">probability that all of the box is free</div><table>{cells}</table>'
+        f'<div style="font-size:22px;font-weight:600;color:{paint(result)}">{odds(result)}</div>'
+        f'<div style="color:#666">{escape(MEANING[result.verdict()])}</div><table>{cells}</table>'
         f'<div style="color:#666;font-size:11px">frame {escape(frame)}: <code>--box {corners}</code></div>'
     )
 
 
 def odds(result: QueryResult) -> str:
-    """P(free) with its standard error."""
-    return f"P(free) = {result.p_free:.2f} ± {result.p_free_se:.2f}"
+    """The verdict, and P(free) with its standard error."""
+    verdict = result.verdict()
+    return verdict if verdict == "unseen" else f"{verdict}: P(free) = {result.p_free:.2f} ± {result.p_free_se:.2f}"
 
 
-def paint(p_free: float) -> str:
-    """The box's colour: free, blocked, or neither (amber)."""
-    return FREE if p_free >= 0.95 else BLOCKED if p_free <= 0.05 else "#d08700"
+def paint(result: QueryResult) -> str:
+    """The box's colour: free, occupied, or neither (amber)."""
+    return {"free": FREE, "occupied": BLOCKED}.get(result.verdict(), "#d08700")
 
 
 def rgb(colour: str) -> tuple[int, int, int]:

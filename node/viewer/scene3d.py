@@ -202,7 +202,8 @@ def first_box(placed: PageScene, unseen: Cloud) -> tuple[Float[np.ndarray, "3"],
     split = unseen.points[unseen.disagreement >= 0.5 * unseen.disagreement.max()]
     tried = np.round(split[:: max(1, len(split) // 40)], 3)
     answers = [ask(placed, point, size) for point in tried]
-    best = min(range(len(tried)), key=lambda i: (answers[i].outside_fraction > 0, abs(answers[i].p_free - 0.5)))
+    odds = np.nan_to_num([answer.p_free for answer in answers], nan=1.0)
+    best = min(range(len(tried)), key=lambda i: (answers[i].outside_fraction > 0, abs(odds[i] - 0.5)))
     return tried[best], size
 
 

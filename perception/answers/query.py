@@ -5,6 +5,7 @@ voxels. Several objects are one scene: given the frame their posteriors are inde
 of each, and the probability that a region is free of all is the product over *objects* of their joint probabilities.
 """
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +18,7 @@ from perception.answers.hypotheses import FrameName, Hypotheses, binary_entropy
 from perception.answers.regions import Cells, Points, Region, Swept
 from probnerf.types import BASE_Z
 
-Verdict = Literal["free", "occupied", "unsure"]
+Verdict = Literal["free", "occupied", "unsure", "unseen"]
 
 # Weight of "all that was not seen is occupied" beside the hypotheses of an object that its prior cannot explain.
 CAUTION = 0.5
@@ -29,7 +30,10 @@ JOINT_DRAWS = 4096  # of the scene's volume, where there are several objects
 
 @dataclass(frozen=True)
 class QueryResult:
-    """The answer about a region. Space outside every object's cube counts as free here: read `outside_fraction` too."""
+    """The answer about a region. Space outside every object's cube counts as free here: read `outside_fraction` too.
+
+    Where all of the region lies there nothing was inferred, and `p_free` and what belongs to it are NaN.
+    """
 
     p_free: float  # probability that no occupied voxel lies in the region
     p_free_se: float  # its Monte Carlo standard error
@@ -49,7 +53,8 @@ class QueryResult:
     p_occupied_few: list[float] | None = None  # the same by the rule of succession, in unseen space
 
     def verdict(self, risk: float = 0.05) -> Verdict:
-        """Free or occupied where the hypotheses' chance of being wrong is at most `risk` in (0, 0.5), else unsure.
+        """Free or occupied where the hypotheses' chance of being wrong is at most `risk` in (0, 0.5), else unsure; unseen
+        where nobody looked at any of it.
 
         The chance accounts for the number of hypotheses: for one object, n effective ones that all agree leave
         1 / (n + 2) (the rule of succession), so for a smaller risk the verdict is always unsure. A region that extends
@@ -58,13 +63,19 @@ class QueryResult:
         """
         if not 0.0 < risk < 0.5:
             raise ValueError(f"risk is {risk:g}; give the chance of being wrong that you accept, above 0 and below 0.5")
+        if self.outside_fraction == 1.0:
+            return "unseen"
         if 1.0 - self.p_free_few <= risk:
             return "free" if self.outside_fraction == 0.0 else "unsure"
         return "occupied" if self.p_free_few <= risk else "unsure"
 
-    def as_dict(self) -> dict[str, float | dict[str, float] | dict[int, list[int]] | list[float]]:
-        """The fields by name, ready for JSON, without those of points where there are none."""
-        return {name: value for name, value in vars(self).items() if value is not None}
+    def as_dict(self) -> dict[str, float | dict[str, float] | dict[int, list[int]] | list[float] | None]:
+        """The fields by name, ready for JSON: None for NaN, without those of points where there are none."""
+        return {
+            name: None if isinstance(value, float) and math.isnan(value) else value
+            for name, value in vars(self).items()
+            if value is not None
+        }
 
 
 def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns: int | None = None) -> QueryResult:
@@ -105,10 +116,11 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
     others = [np.prod(p_free[:o] + p_free[o + 1 :]) for o in range(len(p_free))]
     unseen, outside = _fractions(scene, region, frame)
     points = region if isinstance(region, Points) else None
+    known = math.nan if outside == 1.0 else 1.0
     return QueryResult(
-        p_free=float(np.prod(p_free)),
-        p_free_se=float(np.linalg.norm(np.multiply(p_free_se, others))),
-        p_free_few=float(np.prod(p_free_few)),
+        p_free=known * float(np.prod(p_free)),
+        p_free_se=known * float(np.linalg.norm(np.multiply(p_free_se, others))),
+        p_free_few=known * float(np.prod(p_free_few)),
         volume_m3=_volume_quantiles(volumes),
         unseen_fraction=unseen,
         outside_fraction=outside,
