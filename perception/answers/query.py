@@ -53,8 +53,9 @@ class QueryResult:
     p_occupied_few: list[float] | None = None  # the same by the rule of succession, in unseen space
 
     def verdict(self, risk: float = 0.05) -> Verdict:
-        """Free or occupied where the hypotheses' chance of being wrong is at most `risk` in (0, 0.5), else unsure; unseen
-        where nobody looked at any of it.
+        """Free or occupied where the hypotheses' chance of being wrong is at most `risk` in (0, 0.5), else unsure.
+
+        Unseen is a region that nobody looked at: all of it outside of the objects' cubes, or in the table.
 
         The chance accounts for the number of hypotheses: for one object, n effective ones that all agree leave
         1 / (n + 2) (the rule of succession), so for a smaller risk the verdict is always unsure. A region that extends

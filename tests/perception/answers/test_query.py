@@ -134,7 +134,8 @@ def test_unseen_and_outside_are_shares_of_the_region(mug):
 def test_a_far_box_is_unobserved_not_seen(mug):
     far = query([mug], Box((2.0, 2.0, 2.0), (2.1, 2.1, 2.1)), "object")
     assert far.outside_fraction == 1.0 and far.unseen_fraction == 0.0
-    assert far.p_free == 1.0 and far.volume_m3 == {"q05": 0.0, "q50": 0.0, "q95": 0.0}
+    assert np.isnan([far.p_free, far.p_free_se, far.p_free_few]).all() and far.verdict() == "unseen"
+    assert far.as_dict()["p_free"] is None and far.volume_m3 == {"q05": 0.0, "q50": 0.0, "q95": 0.0}
     nowhere = query([mug], Points(np.full((2, 3), 9.0)), "object")
     assert nowhere.p_occupied == [0.0, 0.0] and nowhere.outside_fraction == 1.0
 
@@ -294,7 +295,7 @@ def test_swept_boxes_are_one_region(mug):
     inner, outer = ((-0.01, -0.01, -0.01), (0.01, 0.01, 0.01)), ((0.5, 0.0, 0.0), (0.52, 0.02, 0.02))
     assert query([mug], _swept(inner, outer), "object").outside_fraction == pytest.approx(0.5, abs=0.01)
     far = query([mug], _swept(outer), "object")
-    assert far.p_free == 1.0 and far.outside_fraction == 1.0 and far.entropy_nats == 0.0
+    assert far.verdict() == "unseen" and far.outside_fraction == 1.0 and far.entropy_nats == 0.0
 
 
 def test_a_turned_thin_box_finds_its_voxels(mug):
