@@ -188,7 +188,7 @@ def test_words_are_plain(mug: Hypotheses) -> None:
     result = scene3d.ask(scene3d.place([mug]), np.zeros(3), np.full(3, 0.01))
     said = panel.answer(result, np.zeros(3), np.full(3, 0.01), "object 1")
     assert panel.odds(result) in said and "--box -0.005 -0.005 -0.005 0.005 0.005 0.005" in said
-    free, blocked = replace(result, p_free=1.0), replace(result, p_free=0.0)
+    free, blocked = replace(result, p_free_few=0.99), replace(result, p_free_few=0.01)
     unseen = replace(result, p_free=np.nan, outside_fraction=1.0)
     assert [panel.paint(r) for r in (blocked, free)] == [panel.BLOCKED, panel.FREE]
     assert "unseen" in panel.odds(unseen) and panel.paint(unseen) not in (panel.BLOCKED, panel.FREE)
