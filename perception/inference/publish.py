@@ -14,7 +14,7 @@ from perception.inference.hilbert_map import HilbertMap, hilbert_map
 from perception.inference.settings import PublishConfig
 from perception.observation.object_frame import ObjectFrame
 from perception.observation.segmentation import Segment
-from perception.observation.visibility import answered_voxels
+from perception.observation.visibility import answered_voxels, surface_voxels
 from perception.sources.frame import Frame
 from probnerf.inference import without_sizes
 from probnerf.likelihood.settings import Likelihood
@@ -122,7 +122,8 @@ def published(
         ),
         result=posterior.result,
     )
-    return _with_error(_beside_smooth(draft, view.smooth_map, smooth, 1.0 - fit) if smooth else draft)
+    mixed = _beside_smooth(draft, view.smooth_map, smooth, 1.0 - fit) if smooth else draft
+    return _with_error(_with_surface(mixed, surface_voxels(view.frame, view.segment, cube, config.grid)))
 
 
 def _flagged_below(prior: Prior, config: PublishConfig) -> float:
@@ -188,6 +189,23 @@ def _mixed(
     names = np.unique(population)
     dealt = names[np.arange(count) % len(names)]
     return np.concatenate([(1.0 - share) * weights, np.full(count, share / count)]), np.concatenate([population, dealt])
+
+
+def _with_surface(h: Hypotheses, surface: Bool[np.ndarray, "G G G"]) -> Hypotheses:
+    """With what the camera measured of the object in every shape: where a shape has nothing within a voxel of it, the
+    measured surface's own voxel is made solid.
+
+    So a part in plain sight that the prior cannot make is in every hypothesis; what is behind it is each shape's own.
+    """
+    at = np.argwhere(surface & h.seen)  # what is told of unseen space is not touched
+    opacity = h.opacity.copy()
+    for shape, solid in zip(opacity, h.solid, strict=True):
+        near = np.zeros(len(at), bool)
+        around = np.pad(solid, 1)
+        for offset in np.ndindex(3, 3, 3):
+            near |= around[tuple((at + offset).T)]
+        shape[tuple(at[~near].T)] = 255
+    return replace(h, opacity=opacity)
 
 
 def _with_error(h: Hypotheses) -> Hypotheses:

@@ -6,10 +6,11 @@ from scipy import ndimage
 
 from calibration.camera import Camera
 from perception.observation.object_frame import ObjectFrame
-from perception.observation.segmentation import Segment
+from perception.observation.segmentation import Segment, backproject
 from perception.observation.without_depth import plane_depth
 from perception.sources.frame import Frame
-from probnerf.rendering.occupancy import above_plane
+from probnerf.pixel_status import OBJECT
+from probnerf.rendering.occupancy import above_plane, voxel_index
 
 
 def seen_voxels(
@@ -23,6 +24,25 @@ def seen_voxels(
     """
     half_diagonal = np.sqrt(3.0) / grid * cube.half_extent
     return _behind_the_end(frame, segment, cube, grid) <= half_diagonal
+
+
+def surface_voxels(
+    frame: Frame, segment: Segment, cube: ObjectFrame, grid: int = 64
+) -> Bool[np.ndarray, "grid grid grid"]:
+    """Voxels above the plane in which a pixel measured the object.
+
+    Pixels at edges of depth (two voxels within their neighbours) are left out: a sensor's may lie between two surfaces.
+    None of a frame without depth.
+    """
+    voxels = np.zeros(grid**3, bool)
+    if frame.depth is not None:
+        ours = (segment.status == OBJECT) & np.isfinite(frame.depth)
+        far = ndimage.maximum_filter(np.where(ours, frame.depth, -np.inf), 3)
+        near = ndimage.minimum_filter(np.where(ours, frame.depth, np.inf), 3)
+        flat = ours & (far - np.where(ours, near, 0.0) < 4.0 / grid * cube.half_extent)
+        points = cube.to_cube(backproject(frame)[flat])
+        voxels[voxel_index(points[(np.abs(points) < 1.0).all(axis=1)], grid)] = True
+    return voxels.reshape(grid, grid, grid) & above_plane(grid)
 
 
 def answered_voxels(

@@ -1,15 +1,17 @@
 """Of which voxels of a cube shapes are asked, and what few populations lose."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter
 
-from perception.inference.publish import _beside_smooth, _hedged, expected_loss
+from perception.inference.publish import _beside_smooth, _hedged, _with_surface, expected_loss
 from perception.observation.rays import observe
 from perception.observation.segmentation import segment
-from perception.observation.visibility import answered_voxels, seen_voxels
+from perception.observation.visibility import answered_voxels, seen_voxels, surface_voxels
 from probnerf.rendering.occupancy import voxel_centres
 from tests.node.mugs import mug_hypotheses, table_frame
 from tests.perception.cylinders import CAN, looking_down, picture
@@ -31,6 +33,36 @@ def test_all_is_asked_but_space_seen_free_well_before_the_surface() -> None:
     over = (above > 4 * voxel) & seen  # the camera looks down on the top
     assert over.any() and not asked[over].all()
     assert (~asked).mean() > 0.15
+
+
+def test_what_was_measured_of_an_object_is_in_every_shape() -> None:
+    """Shapes that lack it get its voxels; a shape that has it, to a voxel, stays as it was."""
+    frame = table_frame()
+    found = segment(frame)[0]
+    mug = mug_hypotheses(frame, found, [0.5, 2.0, 3.0], [0.5, 0.3, 0.2])
+    surface = surface_voxels(frame, found, mug.object_frame, mug.grid)
+    assert surface.sum() > 100 and (surface & ~mug.seen).sum() < 0.1 * surface.sum()
+    surface &= mug.seen
+    half = replace(mug, opacity=np.where(np.arange(mug.grid) < mug.grid // 2, mug.opacity, 0).astype(np.uint8))
+    whole = _with_surface(half, surface)
+    for shape, was in zip(whole.solid, half.solid, strict=True):
+        assert (was <= shape).all()
+        assert (maximum_filter(shape, 3) >= surface).all() and not (maximum_filter(was, 3) >= surface).all()
+    assert ((whole.opacity == half.opacity) | surface).all()
+    np.testing.assert_array_equal(_with_surface(whole, surface).opacity, whole.opacity)
+
+
+def test_pixels_between_two_surfaces_are_of_neither() -> None:
+    frame = table_frame()
+    assert frame.depth is not None
+    found = segment(frame)[0]
+    cube = observe(frame, found)[1]
+    v, u = (int(np.median(a)) for a in np.nonzero(found.mask))
+    flying = frame.depth.copy()
+    flying[v, u] -= 0.03
+    clean, bad = (surface_voxels(replace(frame, depth=d), found, cube, 64) for d in (frame.depth, flying))
+    assert clean.any() and not (bad & ~clean).any()
+    assert not surface_voxels(replace(frame, depth=None), found, cube, 64).any()
 
 
 def _voxel(p: np.ndarray) -> SimpleNamespace:
