@@ -35,4 +35,6 @@ def segments_of(options: FrameOptions, frame: Frame, err: Console) -> Segments:
         raise ValueError(f"{options.source or SHIPPED_LOG}: {error}") from None
     for it in found.left_out:
         err.print(f"object {it.id} is left out: {it.reason}", highlight=False, soft_wrap=True)
+    if found.doubt:
+        err.print(f"warning: {found.doubt}", highlight=False, soft_wrap=True)
     return found

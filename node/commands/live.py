@@ -212,6 +212,8 @@ class LiveNode:
             segments = segment(frame, None, self.config.segment)
         except ValueError as error:
             return self._trouble(str(error))
+        if segments.doubt:
+            self._trouble(segments.doubt)
         for it in segments.left_out:
             self._trouble(f"object {it.id} is left out: {it.reason}")
         looks: list[tuple[Segment, Look]] = []

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from perception.answers.hypotheses import Hypotheses
-from perception.answers.summary import MARGIN_M, Direction, Summary
+from perception.answers.summary import MARGIN_M, Direction, Summary, Undecided, undecided
 from probnerf.types import StopReason
 
 CM3 = 1e6  # per cubic metre
@@ -51,8 +51,18 @@ def figures(h: Hypotheses) -> dict[str, str]:
     return {
         "unseen space": f"{CM3 * space:.0f} cm³",
         "solid in it": f"{CM3 * middle:.0f} cm³ ({CM3 * low:.0f} to {CM3 * high:.0f})",
+        "undecided": _doubt(undecided(h)),
         "hypotheses": f"{len(h.weights)} ({h.effective_hypotheses:.1f} effective)",
     }
+
+
+def _doubt(part: Undecided | None) -> str:
+    """Where shapes disagree most."""
+    if part is None:
+        return "no part of it"
+    places = {"front": "in front", "left": "on the left", "back": "behind", "right": "on the right"}
+    where = "in its middle" if part.side is None else places[part.side]
+    return f"{CM3 * part.volume_m3:.0f} cm³ {where}: solid in a quarter to three quarters of the weight"
 
 
 def diagnostics(h: Hypotheses) -> dict[str, str]:
@@ -88,10 +98,12 @@ def warnings(h: Hypotheses) -> list[str]:
             "the time was up before the sampler converged: the answer is less certain than it can be; raise the budget"
         )
     if (share := h.object_frame.sight_sigma) > 0.0:
-        lines.append(
-            f"no depth: distance and size are known to {100 * share:.1f}%, from the camera's height and tilt alone; "
-            "measure these well, or use a depth camera"
-        )
+        known = f"distance and size are known to {100 * share:.1f}%"
+        if h.object_frame.along_sigma > 0.0:
+            alone = "from the camera's height and tilt alone; measure these well, or use a depth camera"
+            lines.append(f"no depth: {known}, {alone}")
+        else:
+            lines.append(f"{known}, the stated error of depth's scale")
     if not h.inside_view:
         lines.append("the picture's border cuts the object off: move the camera until all of it is in the picture")
     if h.alone:

@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import ndimage
 
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.next_view import rank_views
@@ -14,6 +15,8 @@ from probnerf.rendering.occupancy import voxel_centres
 
 MARGIN_M = 0.01  # a part counts where it reaches farther than this beyond what was seen
 _ABOVE = 60.0  # degrees; a view from higher is one from above
+_DOUBT = 0.25  # a voxel is undecided where its probability is at least this far from 0 and 1
+_SIDES: tuple["Side", ...] = ("front", "right", "back", "left")  # y points to the right of a camera that looks along -x
 _LEAST_GAIN = 0.05  # nats; least expected gain of a next view that is suggested
 
 Side = Literal["front", "left", "back", "right"]
@@ -26,6 +29,14 @@ class Direction:
     side: Side  # of the object: "front" is the side that was seen, left and right are the picture's
     above: bool  # more than 60 degrees above the support plane
     gain_nats: float  # expected information gain of the picture from there
+
+
+@dataclass(frozen=True)
+class Undecided:
+    """The largest unseen part of an object about which its shapes disagree."""
+
+    volume_m3: float
+    side: Side | None  # of the object's upright axis; None: about the axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +102,20 @@ def next_view(h: Hypotheses) -> Direction | None:
         return None
     x, y, z = views.T_object_camera[0, :3, 3]
     azimuth, elevation = np.degrees(np.arctan2(y, x)), np.degrees(np.arctan2(z, np.hypot(x, y)))
-    sides: tuple[Side, ...] = (
-        "front",
-        "right",
-        "back",
-        "left",
-    )  # y points to the right of a camera that looks along -x
-    return Direction(sides[round(azimuth / 90.0) % 4], bool(elevation > _ABOVE), gain)
+    return Direction(_SIDES[round(azimuth / 90.0) % 4], bool(elevation > _ABOVE), gain)
+
+
+def undecided(h: Hypotheses) -> Undecided | None:
+    """The largest connected unseen region above the plane in which every voxel is solid in 1/4 to 3/4 of the weight.
+
+    Sheets of one voxel are left out: a wall is never known better. None: no such region.
+    """
+    doubtful = h.unseen & (np.abs(h.p_occupied - 0.5) <= 0.5 - _DOUBT)
+    parts, count = ndimage.label(ndimage.binary_opening(doubtful, np.ones((2, 2, 2))))
+    if not count:
+        return None
+    part = parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])
+    x, y, _ = voxel_centres(h.grid)[part].mean(axis=0) - [*(h.weights @ h.pose[:, 1:3]), 0.0]
+    beside = np.hypot(x, y) * h.object_frame.half_extent > MARGIN_M
+    side = _SIDES[round(np.degrees(np.arctan2(y, x)) / 90.0) % 4] if beside else None
+    return Undecided(float(part.sum() * h.voxel_m**3), side)

@@ -82,7 +82,8 @@ def published(
         drawn = cube.sight_sigma * jax.random.normal(key, weights.shape)
         camera = jnp.asarray(cube.to_cube(np.zeros(3)), jnp.float32)
         positions = scaled_about(prior.model, positions, pose_sigma, camera, drawn)
-    region = answered_voxels(view.frame, view.segment, cube, config.grid)
+    scaled = view.frame.depth is not None and cube.sight_sigma > 0.0  # then measured places are not certain
+    region = answered_voxels(view.frame, view.segment, cube, config.grid) | scaled
     padded, count = _padded(positions, config.hypotheses), len(weights)
     opacity = opacity_grids(prior.model, sizeless, padded, pose_sigma, jax.device_put(region), coarse=config.coarse)
     pose = poses(prior.model, sizeless, padded, pose_sigma)
@@ -123,7 +124,9 @@ def published(
         result=posterior.result,
     )
     mixed = _beside_smooth(draft, view.smooth_map, smooth, 1.0 - fit) if smooth else draft
-    return _with_error(_with_surface(mixed, surface_voxels(view.frame, view.segment, cube, config.grid)))
+    if cube.sight_sigma == 0.0:
+        mixed = _with_surface(mixed, surface_voxels(view.frame, view.segment, cube, config.grid))
+    return _with_error(mixed)
 
 
 def _flagged_below(prior: Prior, config: PublishConfig) -> float:

@@ -33,7 +33,7 @@ class ObjectFrame:
     xy_sigma: float  # cube units; standard deviation of the axis about the guess
     log_scale_sigma: float
     along_sigma: float = 0.0  # cube units; of the axis towards the camera (x), on top of xy_sigma
-    sight_sigma: float = 0.0  # without depth: relative error of the distance, which place and size share (`monocular`)
+    sight_sigma: float = 0.0  # relative error that distance, place and size share: without depth, or of its scale
 
     def to_camera(self, points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
         """Cube coordinates to the camera frame (m)."""
@@ -68,7 +68,8 @@ def object_frame(frame: Frame, segment: Segment, config: ObjectFrameConfig) -> O
     centre, across, height, top_seen = visible_body(body, cloud_hidden, float(d))
     foot = centre @ axes[:2] - d * up  # on the plane, where n.p = -d
     extra += 0.0 if top_seen else config.side_sigma
-    return _frame_about(foot, across, height, segment, extra, config)
+    cube = _frame_about(foot, across, height, segment, extra, config)
+    return replace(cube, sight_sigma=config.depth_scale_sigma)
 
 
 def _beside_the_unseen(segment: Segment, width: int) -> Bool[np.ndarray, "h w"]:

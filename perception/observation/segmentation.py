@@ -14,6 +14,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from perception.observation.colour_masks import label_colour
+from perception.observation.depth_scale import scale_doubt
 from perception.observation.settings import SegmentConfig
 from perception.observation.standing import candidates, in_box, standing
 from perception.observation.support_plane import heights, horizontal, noise_growth, support_of
@@ -51,6 +52,7 @@ class Segments(Sequence[Segment]):
 
     objects: tuple[Segment, ...]
     left_out: tuple[LeftOut, ...] = ()
+    doubt: str = ""  # what is wrong with the frame's depth (`scale_doubt`)
 
     @overload
     def __getitem__(self, index: int) -> Segment: ...
@@ -141,7 +143,7 @@ def _segment_depth(frame: Frame, object_id: int | None, config: SegmentConfig) -
         left.append(LeftOut(i, mask, reason))
     if not segments:
         raise ValueError(f"no object has {config.min_pixels} pixels of depth; move the camera nearer")
-    return Segments(tuple(segments), tuple(left))
+    return Segments(tuple(segments), tuple(left), scale_doubt(frame, next(iter(found.values()))[1], config.guess))
 
 
 def _supports(points: Float[np.ndarray, "h w 3"], frame: Frame, config: SegmentConfig) -> list[Float[np.ndarray, "4"]]:

@@ -94,10 +94,17 @@ class ObjectFrameConfig:
     log_scale_sigma: float = 0.06
     hidden_sigma: float = 0.3  # added to all standard deviations, times the share of the outline hidden or cut off
     side_sigma: float = 0.08  # added to all standard deviations where the camera does not look down on the top
+    depth_scale_sigma: float = 0.0  # relative error of depth's scale, which no view shows: place and size get it, too
     rim_reach: float = 0.02  # m; a rim pixel this near its neighbour inside the outline belongs to the object
     outline_px: int = 5  # px from the outline within which a nearer object may hide more of this one
     min_height: float = 0.02  # m; the prior's range of sizes
     max_side: float = 0.40  # m
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.depth_scale_sigma < 0.5:
+            raise ValueError(
+                f"depth_scale_sigma is {self.depth_scale_sigma:g}; give a relative error, 0.05 for 5%, below 0.5"
+            )
 
 
 @dataclass(frozen=True)

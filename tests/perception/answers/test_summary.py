@@ -7,7 +7,7 @@ import pytest
 
 from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
-from perception.answers.summary import Direction, next_view, size, sticks_out, summarise
+from perception.answers.summary import Direction, next_view, size, sticks_out, summarise, undecided
 from perception.observation.object_frame import ObjectFrame
 from probnerf.geometry import look_at
 from probnerf.rendering.occupancy import voxel_centres
@@ -55,6 +55,18 @@ def test_size_is_the_weighted_median_of_the_shapes() -> None:
     wide = ((-0.04, -0.08, -0.12), (0.04, 0.08, 0.02))
     assert size(bodies([[BODY], [wide]], [0.6, 0.4])) == pytest.approx([0.10, 0.08, 0.14])
     assert size(bodies([[BODY], [wide]], [0.4, 0.6])) == pytest.approx([0.16, 0.08, 0.14])
+
+
+def test_what_is_undecided_is_where_shapes_disagree() -> None:
+    part = undecided(bodies([[BODY], [BODY, BACK]], [0.6, 0.4]))
+    assert part is not None and part.side == "back"
+    assert part.volume_m3 == pytest.approx(0.05 * 0.02 * 0.06)
+    assert undecided(bodies([[BODY], [BODY, BACK]], [0.9, 0.1])) is None  # decided, nearly
+    thicker = ((-0.05, -0.05, -0.12), (0.04, 0.05, 0.02))
+    assert undecided(bodies([[BODY], [thicker]], [0.5, 0.5])) is None  # a wall within a voxel
+    tube = [((-0.04, -0.05, -0.12), (0.04, -0.03, 0.02)), ((-0.04, 0.03, -0.12), (0.04, 0.05, 0.02))]
+    inside = undecided(bodies([[BODY], tube], [0.5, 0.5], seen=np.zeros((GRID,) * 3, bool)))
+    assert inside is not None and inside.side is None
 
 
 def test_a_handle_behind_in_half_of_the_weight_is_a_chance_of_a_half() -> None:
