@@ -94,16 +94,19 @@ class Inference:
         """Whether Ctrl-C ended it."""
         return self.answer is not None and self.answer.result == StopReason.INTERRUPTED
 
-    def begin(self, guess: bool | None = None) -> None:
-        """Make ready to sample. The network's or the encoder's guess becomes the answer where it is wanted: `guess`, or
-        the callbacks, say so.
-        """
+    def guess(self) -> None:
+        """Answer at once, by the network or the encoder where there is one to ask."""
         with self._counted():
-            sampler, publisher = self._sampler, self._publisher
-            wanted = publisher.wants_guess if guess is None else guess
+            if self._sampler.asks_network or self._sampler.asks_encoder:
+                self.answer = self._publisher.hand_out_guess()
+
+    def begin(self) -> None:
+        """Make ready to sample, after a guess where the callbacks want it."""
+        sampler, publisher = self._sampler, self._publisher
+        if publisher.wants_guess and self.answer is None:
+            self.guess()
+        with self._counted():
             if sampler.asks_network:
-                if wanted:
-                    self.answer = publisher.hand_out_guess()
                 draws = sampler.weigh()
                 if draws is not None:
                     enough = draws.suffice(self.config.infer.network)
@@ -112,8 +115,6 @@ class Inference:
                         self._runs = [draws.posterior()]
                         self._end(publisher.publish_draws(self._runs[0]))
             elif sampler.asks_encoder:
-                if wanted:
-                    self.answer = publisher.hand_out_guess()
                 sampler.climb()
 
     def step(self, runs: int | None = None, deadline: float | None = None) -> bool:

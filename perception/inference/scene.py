@@ -48,7 +48,7 @@ def _in_rounds(
     for segment in segments:
         try:
             inference = start(segment, end)
-            inference.begin(guess=True)
+            inference.guess()
         except ValueError as error:
             yield segment, error
             continue
@@ -57,9 +57,11 @@ def _in_rounds(
     for i, (_, inference) in enumerate(waiting):
         now = time.monotonic()
         share = (end - now) / (len(waiting) - i)
-        if interrupted or inference.done or (share <= 0.0 and inference.answer is not None):
+        if interrupted or (share <= 0.0 and inference.answer is not None):
             continue
-        inference.step(1, now + max(share, 1.0))
+        inference.begin()
+        if not inference.done:
+            inference.step(1, now + max(share, 1.0))
         interrupted = inference.interrupted
     while not interrupted and waiting:
         for segment, inference in [pair for pair in waiting if pair[1].done]:

@@ -47,9 +47,12 @@ class Inference:
     def interrupted(self) -> bool:
         return self.reason == StopReason.INTERRUPTED
 
-    def begin(self, guess: bool | None = None) -> None:
+    def guess(self) -> None:
         self.clock.now += 0.5
-        self.answer = "guess" if guess else None
+        self.answer = "guess"
+        self.diary.append(f"{self.name} guesses")
+
+    def begin(self) -> None:
         self.diary.append(f"{self.name} begins")
 
     def step(self, runs: int | None = None, deadline: float | None = None) -> bool:
@@ -106,8 +109,8 @@ def test_without_a_budget_one_object_is_finished_after_the_other(monkeypatch: py
 def test_all_first_answers_come_first_then_first_runs_then_what_may_gain_most(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene(monkeypatch, [0.2, 0.1, 0.0], [0.0], [0.4, 0.15, 0.0])
     found = scene.answers(100.0)
-    begun, first = ["1 begins", "2 begins", "3 begins"], ["1 runs", "2 runs", "3 runs"]
-    assert scene.diary == [*begun, *first, "3 runs", "1 runs", "3 runs", "1 runs"]
+    first = [f"{i} guesses" for i in (1, 2, 3)] + [f"{i} {does}" for i in (1, 2, 3) for does in ("begins", "runs")]
+    assert scene.diary == [*first, "3 runs", "1 runs", "3 runs", "1 runs"]
     assert [name for name, _ in found] == [2, 3, 1]  # each as soon as it is done
     assert all(made.reason is None for made in scene.made)
 
@@ -123,14 +126,14 @@ def test_every_object_gets_its_share_of_a_short_budget(monkeypatch: pytest.Monke
 def test_a_run_that_its_share_cut_is_made_again_if_there_is_time(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene(monkeypatch, [0.0], [0.0], first_cost=20.0)  # such as of compiling
     found = scene.answers(28.0)
-    assert scene.diary[2:] == ["1 is cut", "2 runs", "1 runs"]
+    assert scene.diary[2:] == ["1 begins", "1 is cut", "2 begins", "2 runs", "1 runs"]
     assert [(name, e.runs, e.reason) for name, e in found] == [(2, 1, None), (1, 1, None)]
 
 
 def test_runs_that_are_cut_are_answers_where_there_is_no_time_for_more(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene(monkeypatch, [0.0], [0.0], cost=9.0)
     found = scene.answers(17.0)  # both have 8 s of 9
-    assert scene.diary[2:] == ["1 is cut", "2 is cut"] and scene.clock.now == 17.0
+    assert scene.diary[2:] == ["1 begins", "1 is cut", "2 begins", "2 is cut"] and scene.clock.now == 17.0
     assert [(name, e.answer) for name, e in found] == [(2, "shapes"), (1, "shapes")]
 
 
@@ -138,7 +141,7 @@ def test_without_time_for_runs_the_first_answers_stand(monkeypatch: pytest.Monke
     scene = Scene(monkeypatch, [0.3, 0.0], [0.0], [0.0])
     found = scene.answers(1.0)
     assert [(name, e.answer, e.reason) for name, e in found] == [(i, "guess", StopReason.BUDGET) for i in (1, 2, 3)]
-    assert scene.diary == ["1 begins", "2 begins", "3 begins"]
+    assert scene.diary == ["1 guesses", "2 guesses", "3 guesses"]
 
 
 def test_what_the_caller_needs_is_kept_back(monkeypatch: pytest.MonkeyPatch) -> None:
