@@ -20,6 +20,7 @@ from probnerf.inference import without_sizes
 from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.checkpoint import Prior
 from probnerf.prior.networks import ProbNeRF
+from probnerf.rendering.occupancy import WALL_OPACITY
 from probnerf.sampling.populations import thin
 from probnerf.shapes import explained, opacity_grids, poses, scaled_about
 from probnerf.types import Observation, Posterior
@@ -202,12 +203,12 @@ def _with_surface(h: Hypotheses, surface: Bool[np.ndarray, "G G G"]) -> Hypothes
     """
     at = np.argwhere(surface & h.seen)  # what is told of unseen space is not touched
     opacity = h.opacity.copy()
-    for shape, solid in zip(opacity, h.solid, strict=True):
+    for shape in opacity:
+        walls = np.pad(shape >= 255.0 * WALL_OPACITY, 1)
         near = np.zeros(len(at), bool)
-        around = np.pad(solid, 1)
         for offset in np.ndindex(3, 3, 3):
-            near |= around[tuple((at + offset).T)]
-        shape[tuple(at[~near].T)] = 255
+            near |= walls[tuple((at + offset).T)]
+        shape[tuple(at[~near].T)] = 255  # inside of a solid, too, where it is solid already
     return replace(h, opacity=opacity)
 
 

@@ -31,7 +31,7 @@ class ControllerConfig(PublishConfig):
 
     infer: InferConfig = field(default_factory=InferConfig)  # of one run
     observe: ObserveConfig = field(default_factory=ObserveConfig)
-    first_hypotheses: int = 48  # published while better ones are under way
+    first_hypotheses: int = 24  # published while better ones are under way; 48 score no better
     first_coarse: int = 2  # their `coarse`: 48 shapes at 2 cost less than 8 at 1
     unexplained: float = 0.1  # share of pixels above which all runs are made
     tolerance: float = 0.005  # nats per voxel of unseen space; accepted loss from having few populations

@@ -6,6 +6,7 @@ With depth the plane is measured. Without, it is supposed (`PlaneGuess`) and col
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import overload
 
 import numpy as np
@@ -227,13 +228,16 @@ def _around(mask: Bool[np.ndarray, "h w"], width: int) -> tuple[Bool[np.ndarray,
     return grown, ndimage.binary_erosion(mask, _SQUARE, iterations=width, border_value=1)
 
 
+@lru_cache(maxsize=2)  # every object of a frame asks
 def backproject(frame: Frame) -> Float[np.ndarray, "h w 3"]:
     """The point that each pixel sees, camera frame (m), NaN without depth. `ValueError` on a frame that has none."""
     if frame.depth is None:
         raise ValueError(f"frame at {frame.stamp_ns} ns has no depth")
     v, u = np.mgrid[: frame.depth.shape[0], : frame.depth.shape[1]]
     rays = frame.camera.rays(np.column_stack([u.ravel(), v.ravel()]))
-    return (rays / rays[:, 2:]).reshape(*u.shape, 3) * frame.depth[..., None]
+    points = (rays / rays[:, 2:]).reshape(*u.shape, 3) * frame.depth[..., None]
+    points.flags.writeable = False
+    return points
 
 
 def _own_plane(

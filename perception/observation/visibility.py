@@ -1,5 +1,7 @@
 """The part of an object's cube that the camera saw."""
 
+from functools import lru_cache
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
@@ -55,6 +57,7 @@ def answered_voxels(
     return rest | ndimage.binary_dilation(rest & above_plane(grid), iterations=2)
 
 
+@lru_cache(maxsize=2)  # what is seen of an object, and where its shapes are asked
 def _behind_the_end(
     frame: Frame, segment: Segment, cube: ObjectFrame, grid: int
 ) -> Float[np.ndarray, "grid grid grid"]:
@@ -65,7 +68,9 @@ def _behind_the_end(
     distance = np.linalg.norm(points, axis=1)
     with np.errstate(invalid="ignore"):
         behind = np.where(inside, distance * (1.0 - z / points[:, 2]), np.nan)
-    return behind.reshape(grid, grid, grid)
+    behind = behind.reshape(grid, grid, grid)
+    behind.flags.writeable = False
+    return behind
 
 
 def inside_view(camera: Camera, cube: ObjectFrame, grid: int = 64) -> Bool[np.ndarray, "grid grid grid"]:

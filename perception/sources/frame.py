@@ -56,6 +56,7 @@ class Frame:
             _check_metres(depth)
             with np.errstate(invalid="ignore"):
                 depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan))
+            depth.flags.writeable = False  # what is computed from a frame is kept for it
         if label is not None:
             label = _plane("label", label, np.int32, rgb)
         values = (rgb, depth, camera, label, stamp_ns, frame_id, T_world_camera)

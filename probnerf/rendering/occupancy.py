@@ -104,12 +104,15 @@ def _centre_z(grid: int) -> Float[np.ndarray, "G"]:
 def _fill(walls: Bool[np.ndarray, "G G G"]) -> Bool[np.ndarray, "G G G"]:
     """Dilate walls by one voxel, fill voxels that the outside cannot reach, erode by one voxel."""
     filled = np.zeros_like(walls)
-    box = ndimage.find_objects(walls.view(np.uint8))  # bounding box of all walls; the rest is outside
-    if box:
+    columns = np.any(walls, axis=2)
+    if columns.any():
+        occupied = (np.any(columns, axis=1), np.any(columns, axis=0), np.any(walls, axis=(0, 1)))
+        sides = [np.flatnonzero(side) for side in occupied]
+        box = tuple(slice(side[0], side[-1] + 1) for side in sides)  # bounding box of all walls; the rest is outside
         # a margin for the dilation, then a border of outside voxels
-        grown = _dilate(np.pad(walls[box[0]], 2))
+        grown = _dilate(np.pad(walls[box], 2))
         empty, _ = ndimage.label(~grown, structure=_SIX_CONNECTED)
-        filled[box[0]] = _erode(empty != empty[0, 0, 0])[2:-2, 2:-2, 2:-2]
+        filled[box] = _erode(empty != empty[0, 0, 0])[2:-2, 2:-2, 2:-2]
     return filled
 
 

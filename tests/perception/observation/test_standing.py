@@ -127,7 +127,9 @@ def test_a_wrong_unit_of_the_depth_is_named(factor: float, says: str) -> None:
 def test_missing_depth_inside_an_outline_is_not_free() -> None:
     frame = picture(CAN)
     v, u = (round(float(np.median(at))) for at in np.nonzero(frame.label == 1))
-    frame.depth[v - 5 : v + 5, u - 5 : u + 5] = np.nan
-    (found,) = segment(unlabelled(frame))
+    assert frame.depth is not None
+    holed = frame.depth.copy()
+    holed[v - 5 : v + 5, u - 5 : u + 5] = np.nan
+    (found,) = segment(unlabelled(replace(frame, depth=holed)))
     assert found.mask[v, u]
     assert not (found.status[v - 5 : v + 5, u - 5 : u + 5] == FREE).any()
