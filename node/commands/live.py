@@ -23,7 +23,9 @@ from node.ros.scene_messages import DiagnosticStatus, Level
 from node.ros.services import Answers
 from node.ros.topic_source import TopicSource
 from perception.answers.hypotheses import Hypotheses
+from perception.inference.inference import Inference
 from perception.inference.limits import Callbacks, Limits
+from perception.inference.scene import estimate_scene
 from perception.inference.schedule import config_hash, scheduled
 from perception.inference.tracker import Change, Look, Tracker
 from perception.inference.warm_up import warm_up
@@ -228,19 +230,29 @@ class LiveNode:
         if self._scene or not looks:
             self._publish(frame, ids)
         for _, look in looks:
-
-            def answered(h: Hypotheses) -> None:
-                self._scene[h.object_id] = h
-                self._publish(frame, ids)
-                self._tell_status()
-
             if look.settled:
                 self.tracker.infer(look)
+        waiting = {look.object_id: look for _, look in looks if not look.settled}
+        if (now := time.monotonic()) >= self._until:
+            return
+
+        def answered(h: Hypotheses) -> None:
+            self._scene[h.object_id] = h
+            self._publish(frame, ids)
+            self._tell_status()
+
+        def start(found: Segment, deadline: float | None) -> Inference:
+            return self.tracker.begin(waiting[found.id], Limits(deadline), Callbacks(on_answer=answered))
+
+        interrupted = False
+        every = [look.segment for look in waiting.values()]
+        deadline = min(now + len(every) * self.config.budget, self._until)
+        for found, result in estimate_scene(every, start, deadline):
+            if isinstance(result, ValueError):
+                self._trouble(f"object {found.id}: {result}")
                 continue
-            if (now := time.monotonic()) >= self._until:
-                return
-            limits = Limits(deadline=min(now + self.config.budget, self._until))
-            update = self.tracker.infer(look, limits, Callbacks(on_answer=answered))
+            look = waiting[found.id]
+            update = self.tracker.keep(look, result)
             self.inferences += 1
             h = update.hypotheses
             self._record(h, look)
@@ -252,8 +264,9 @@ class LiveNode:
                 highlight=False,
                 soft_wrap=True,
             )
-            if h.result == StopReason.INTERRUPTED:  # the sampler caught a Ctrl-C meant for the whole node
-                raise KeyboardInterrupt
+            interrupted |= h.result == StopReason.INTERRUPTED
+        if interrupted:  # the sampler caught a Ctrl-C meant for the whole node
+            raise KeyboardInterrupt
 
     def _publish(self, frame: Frame, segments: dict[int, Segment]) -> None:
         objects = list(self._scene.values())
@@ -271,7 +284,8 @@ class LiveNode:
     def _record(self, h: Hypotheses, look: Look) -> None:
         if self.recorder is None:
             return
-        self.recorder.write_schedule(scheduled(h, self._hash, "tracked" if look.builds_on else "fresh"))
+        if h.stage > 0 or h.result == StopReason.CONVERGED:  # not a mere guess, which the next frame does better
+            self.recorder.write_schedule(scheduled(h, self._hash, "tracked" if look.builds_on else "fresh"))
         message = hypotheses_message(h, self.config.controller.infer.method)
         data = bytes(encode(message))
         self.recorder.write_raw(HYPOTHESES_TOPIC, HYPOTHESES, definition(HYPOTHESES), data, h.stamp_ns)

@@ -162,7 +162,8 @@ class LiveConfig:
     token: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Put a random token into the page's address: nobody else on this machine can open it."""
     budget: Annotated[float, arg(metavar="SECONDS")] = 40.0
-    """Sampling time for each object of a frame. What has not converged continues with the next frame."""
+    """Time for each object of a frame, shared as each has need. What has not converged goes on with the next
+    frame."""
     pace: Annotated[float, arg(metavar="X")] = 1.0
     """Speed of a recording: 1 as it was made, 2 twice as fast, 0 as fast as it can be read."""
     seconds: Annotated[float | None, arg(metavar="N", help_behavior_hint="(default: until Ctrl-C)")] = None

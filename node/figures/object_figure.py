@@ -2,6 +2,7 @@
 
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -10,6 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, ListedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from scipy import ndimage
 
 from foundation.whole_file import whole_file
 from node.figures import voxel_renderer
@@ -44,7 +46,7 @@ def draw_object(path: Path, h: Hypotheses, frame: Frame | None = None, segment: 
     chosen, shares = shown(h, SHOWN)
     for column, (index, share) in enumerate(zip(chosen, shares, strict=True), start=1):
         for row, view in enumerate((front, back)):
-            picture = voxel_renderer.shade(h, h.solid[index], view, float(h.base[index]))
+            picture = voxel_renderer.shade(h, voxel_renderer.level(h, index), view, float(h.base[index]))
             axes[row, column].imshow(picture, interpolation="bilinear")
         axes[0, column].set_title(f"{100 * share:.0f}% of the weight", fontsize=11)
     axes[0, 1].set_ylabel("from the camera", fontsize=11)
@@ -147,24 +149,30 @@ def _draw_view(above: Axes, below: Axes, h: Hypotheses, frame: Frame | None, seg
 def _draw_disagreement(
     figure: Figure, behind: Axes, above: Axes, h: Hypotheses, back: voxel_renderer.Viewpoint
 ) -> None:
-    """Binary entropy of p_occupied, the largest along each line of sight, over a pale picture of the likely shape."""
+    """Where shapes differ by more than the place of a wall: binary entropy of p_occupied at unseen voxels two or more
+    from the likely shape's surface, the largest along each line of sight, over a pale picture of that shape.
+    """
     likely = h.p_occupied >= 0.5
-    behind.imshow(0.5 + 0.5 * voxel_renderer.shade(h, likely, back).mean(axis=2), cmap="gray", vmin=0, vmax=1)
-    from_behind = voxel_renderer.largest_along(h.disagreement, back)
-    behind.imshow(from_behind, cmap=_DISAGREEMENT, vmin=0, vmax=_LOG2, alpha=np.clip(2 * from_behind / _LOG2, 0, 1))
-    from_above = h.disagreement.max(axis=2).T
+    wall = ndimage.binary_dilation(likely, iterations=2) & ~ndimage.binary_erosion(likely, iterations=2)
+    differ = np.where(wall | ~h.unseen, 0.0, h.disagreement)
+    differ *= ndimage.binary_opening(differ > 0.1, np.ones((2, 2, 2)))  # without single voxels
+    pale = voxel_renderer.shade(h, h.p_occupied, back).mean(axis=2)
+    behind.imshow(0.5 + 0.5 * pale, cmap="gray", vmin=0, vmax=1, interpolation="bilinear")
+    from_behind = voxel_renderer.largest_along(differ, back)
+    scale: dict[str, Any] = {"cmap": _DISAGREEMENT, "vmin": 0, "vmax": _LOG2, "interpolation": "bilinear"}
+    behind.imshow(from_behind, alpha=np.clip(2 * from_behind / _LOG2, 0, 1), **scale)
+    from_above = differ.max(axis=2).T
     above.imshow(np.where(likely.any(axis=2).T, 0.8, 1.0), cmap="gray", vmin=0, vmax=1, origin="lower")
-    alpha = np.clip(2 * from_above / _LOG2, 0, 1)
-    above.imshow(from_above, cmap=_DISAGREEMENT, vmin=0, vmax=_LOG2, alpha=alpha, origin="lower")
-    behind.set_title("disagreement, from behind", fontsize=11)
-    above.set_title("disagreement, from above", fontsize=11)
+    above.imshow(from_above, alpha=np.clip(2 * from_above / _LOG2, 0, 1), origin="lower", **scale)
+    behind.set_title("where shapes differ, from behind", fontsize=11)
+    above.set_title("where shapes differ, from above", fontsize=11)
     _point_to_camera(above)
     _add_bar(
         figure,
         _DISAGREEMENT,
         _LOG2,
         [behind, above],
-        "largest entropy on the line of sight, nats (log 2: evenly split)",
+        "largest entropy on the line of sight, two voxels off the likely surface, nats",
     )
 
 
@@ -180,7 +188,7 @@ def _draw_sections(figure: Figure, horizontal: Axes, vertical: Axes, h: Hypothes
         (horizontal, p[:, :, k].T, h.seen[:, :, k].T, f"from above, at {100 * h.voxel_m * (k + 0.5 - base):.1f} cm"),
         (vertical, p[:, grid // 2, :].T, h.seen[:, grid // 2, :].T, "from the side, through the axis"),
     ):
-        ax.imshow(values, origin="lower", cmap=_OCCUPIED, vmin=0, vmax=1)
+        ax.imshow(values, origin="lower", cmap=_OCCUPIED, vmin=0, vmax=1, interpolation="bilinear")
         ax.imshow(seen, origin="lower", cmap=veil, vmin=0, vmax=1, alpha=0.6, interpolation="nearest")
         ax.set_title(title, fontsize=11)
         _point_to_camera(ax)

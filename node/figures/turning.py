@@ -30,9 +30,9 @@ def draw_turning(path: Path, h: Hypotheses, frame: Frame | None = None, steps: i
         view = voxel_renderer.viewpoint(h.object_frame, _PIXELS)
         panels = [voxel_renderer.look_up(frame.rgb, frame.camera, h.object_frame, view, 255) / 255.0]
         labels = ["the one view", *labels]
-    pictures = []
+    pictures, levels = [], [voxel_renderer.level(h, i) for i in index]
     for view in voxel_renderer.orbit(h.object_frame, _PIXELS, steps):
-        shapes = [voxel_renderer.shade(h, h.solid[i], view, float(h.base[i])) for i in index]
+        shapes = [voxel_renderer.shade(h, levels[k], view, float(h.base[i])) for k, i in enumerate(index)]
         pictures.append(_labelled(np.concatenate([*panels, *shapes], axis=1), labels))
     sides = np.concatenate([np.asarray(pictures[0]), np.asarray(pictures[steps // 2])])
     palette = Image.fromarray(sides).quantize(_COLOURS)

@@ -6,7 +6,8 @@ A viewpoint looks at the cube's centre; pictures are square. Symbols: G voxels p
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Shaped
+from scipy import ndimage
 
 from calibration.camera import Camera
 from perception.answers.hypotheses import Hypotheses
@@ -22,6 +23,7 @@ STATUS = {OBJECT: ("object", "#2ca02c"), FREE: ("free", "#4f8fd0"), UNKNOWN: ("u
 _GROUND = np.array([0.93, 0.93, 0.92])
 _HIGHEST = np.deg2rad(35.0)  # elevation from which the far side is shown
 _STEP = 0.75  # voxels
+_LEAST_PART = 0.01  # of the largest part's voxels; smaller ones are not drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +83,28 @@ def look_up(image: np.ndarray, camera: Camera, frame: ObjectFrame, view: Viewpoi
     return found.reshape(view.size, view.size, *image.shape[2:])
 
 
+def level(h: Hypotheses, index: int) -> Float[np.ndarray, "G G G"]:
+    """A field whose surface at 1/2 is that of a hypothesis: its walls' opacity, which places the surface between
+    voxels, and 1 inside. Parts of less than a hundredth of the largest one are left out.
+    """
+    solid = h.solid[index]
+    parts, _ = ndimage.label(solid, np.ones((3, 3, 3)))
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    solid = solid & (sizes >= _LEAST_PART * sizes.max())[parts]
+    opacity = h.opacity[index].astype(np.float32) / 255.0
+    inside = ndimage.binary_erosion(solid)
+    outside = np.where(sizes[parts] == 0, np.minimum(opacity, 0.45), 0.0)
+    return np.where(solid, np.where(inside, 1.0, np.maximum(opacity, 0.55)), outside)
+
+
 def shade(
-    h: Hypotheses, solid: Bool[np.ndarray, "G G G"], view: Viewpoint, base: float = BASE_Z
+    h: Hypotheses, shape: Shaped[np.ndarray, "G G G"], view: Viewpoint, base: float = BASE_Z
 ) -> Float[np.ndarray, "s s 3"]:
-    """A shape on the plane at height `base`, lit from above left; grey where the camera saw it, orange elsewhere."""
+    """A shape (`level`, or which voxels are solid) on the plane at height `base`, lit from above left; grey where the
+    camera saw it, orange elsewhere.
+    """
+    solid = shape >= 0.5
     rgb = np.ones((len(view.directions), 3))
     ground = _meet_ground(view, base)
     with np.errstate(invalid="ignore"):
@@ -94,11 +114,12 @@ def shade(
     for _ in range(3):
         low = _blurred(low)
     rgb[lit] = _GROUND * (1.0 - 0.35 * nearest(np.pad(low, 1), *on_ground[lit][:, :2].T))[:, None]
-    t, normals = march(solid, view)
+    t, normals = march(shape, view)
     hit = np.isfinite(t) & ~(ground < t - 0.03)
     points = view.origin + t[hit, None] * view.directions[hit]
     # Was the space in front of the surface seen? The surface itself is within the noise of depth.
-    seen = nearest(np.pad(h.seen, 1), *(points + 2.5 / solid.shape[0] * normals[hit]).T)
+    before = points + 2.5 / solid.shape[0] * normals[hit]
+    seen = _trilinear(_blurred(_blurred(h.seen.astype(np.float32))), before) >= 0.5
     paint = np.where(seen[:, None], SEEN, UNSEEN)
     T = view.T_cube_camera
     light = T[:3, :3] @ np.array([-0.5, -0.7, -0.6])  # to the left, up, towards the viewer
@@ -109,17 +130,21 @@ def shade(
     return np.clip(rgb, 0.0, 1.0).reshape(view.size, view.size, 3)
 
 
-def march(solid: Bool[np.ndarray, "G G G"], view: Viewpoint) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+def march(
+    shape: Shaped[np.ndarray, "G G G"], view: Viewpoint
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
     """Distance to the first surface along each ray (inf: none) and its outward unit normal."""
+    solid = shape >= 0.5
     t_hit, normals = np.full(len(view.directions), np.inf), np.zeros((len(view.directions), 3))
     if not solid.any():
         return t_hit, normals
     grid = solid.shape[0]
-    field = _blurred(solid.astype(np.float32))
+    field = _blurred(shape.astype(np.float32))
     occupied = np.argwhere(solid)
     low, high = -1.0 + (occupied.min(axis=0) - 1) * 2.0 / grid, -1.0 + (occupied.max(axis=0) + 2) * 2.0 / grid
     step = _STEP * 2.0 / grid
-    for rays, t, inside in met(np.pad(field >= 0.5, 1), view.origin, view.directions, _STEP, low=low, high=high):
+    fine = np.pad(_doubled(field) >= 0.5, 1)  # else an outline has steps of a voxel
+    for rays, t, inside in met(fine, view.origin, view.directions, 2.0 * _STEP, low=low, high=high):
         hit = np.flatnonzero(inside.any(axis=1))
         t_hit[rays[hit]] = t[hit, inside[hit].argmax(axis=1)]
     chosen = np.flatnonzero(np.isfinite(t_hit))
@@ -157,6 +182,16 @@ def _blurred(field: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         wide = np.pad(field, [(1, 1) if a == axis else (0, 0) for a in range(field.ndim)])
         wide = np.moveaxis(wide, axis, 0)
         field = np.moveaxis(0.25 * wide[:-2] + 0.5 * wide[1:-1] + 0.25 * wide[2:], 0, axis)
+    return field
+
+
+def _doubled(field: Float[np.ndarray, "G G G"]) -> Float[np.ndarray, "H H H"]:
+    """Interpolated at the middles of half as large voxels (H = 2 G); the border's value outside."""
+    for axis in range(3):
+        wide = np.moveaxis(np.pad(field, [(1, 1) if a == axis else (0, 0) for a in range(3)], mode="edge"), axis, 0)
+        below, above = 0.25 * wide[:-2] + 0.75 * wide[1:-1], 0.75 * wide[1:-1] + 0.25 * wide[2:]
+        pairs = np.stack([below, above], axis=1)
+        field = np.moveaxis(pairs.reshape(-1, *pairs.shape[2:]), 0, axis)
     return field
 
 

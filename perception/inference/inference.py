@@ -95,9 +95,9 @@ class Inference:
         return self.answer is not None and self.answer.result == StopReason.INTERRUPTED
 
     def guess(self) -> None:
-        """Answer at once, by the network or the encoder where there is one to ask."""
+        """Answer at once, by the network or the encoder, where there is one to ask and the callbacks allow a guess."""
         with self._counted():
-            if self._sampler.asks_network or self._sampler.asks_encoder:
+            if self.callbacks.guess and (self._sampler.asks_network or self._sampler.asks_encoder):
                 self.answer = self._publisher.hand_out_guess()
 
     def begin(self) -> None:

@@ -11,12 +11,14 @@ that the hypotheses do not explain shows an object that moved.
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from perception.answers.hypotheses import Hypotheses
-from perception.inference.controller import infer_view
+from perception.inference.controller import Estimate, infer_view
+from perception.inference.inference import Inference
 from perception.inference.limits import NO_CALLBACKS, NO_LIMITS, Callbacks, Limits
 from perception.inference.publish import ConditionedView
 from perception.inference.settings import ControllerConfig, TrackConfig
@@ -94,6 +96,11 @@ class Look:
         return self.change in (Change.VIEW, Change.CONTINUED)
 
     @property
+    def segment(self) -> Segment:
+        """The frame's segment, under the object's own id."""
+        return self._view.segment
+
+    @property
     def settled(self) -> bool:
         """Whether there is nothing to infer."""
         return self.change == Change.SAME
@@ -164,19 +171,23 @@ class Tracker:
         if look.settled and track is not None and look.hypotheses is not None:
             self._tracks[look.object_id] = replace(track, hypotheses=look.hypotheses)
             return Update(look.change, look.hypotheses, 0, look.agreement, 0.0)
-        before = None
+        return self.keep(look, infer_view(look._view, self.prior, self.config, **self._asked(look, limits, callbacks)))
+
+    def begin(self, look: Look, limits: Limits = NO_LIMITS, callbacks: Callbacks = NO_CALLBACKS) -> Inference:
+        """The sampling that a look requires, to be done in steps; its estimate is for `keep`."""
+        return Inference(look._view, self.prior, self.config, **self._asked(look, limits, callbacks))
+
+    def _asked(self, look: Look, limits: Limits, callbacks: Callbacks) -> dict[str, Any]:
+        before, track = None, look._track
         if look.change == Change.CONTINUED and track is not None:
             estimates = np.asarray(track.posterior.diagnostics.log_evidences)
             before = track.posterior if np.isfinite(estimates).all() else None
-        result = infer_view(
-            look._view,
-            self.prior,
-            self.config,
-            seed=look.seed,
-            before=before,
-            limits=limits,
-            callbacks=replace(callbacks, guess=callbacks.guess and look.hypotheses is None),
-        )
+        callbacks = replace(callbacks, guess=callbacks.guess and look.hypotheses is None)
+        return {"seed": look.seed, "before": before, "limits": limits, "callbacks": callbacks}
+
+    def keep(self, look: Look, result: Estimate) -> Update:
+        """Store what a look's sampling found."""
+        track = look._track
         self._tracks[look.object_id] = _Track(
             anchor=look._view.object_frame if track is None else track.anchor,
             first=look._view.frame if track is None else track.first,
