@@ -137,6 +137,10 @@ def _pose_prior(config: ControllerConfig, amount: float) -> ControllerConfig:
     return replace(config, observe=replace(o, **{name: amount * getattr(o, name) for name in names}))
 
 
+def _stated(config: ControllerConfig, amount: float) -> ControllerConfig:
+    return replace(config, observe=replace(config.observe, depth_scale_sigma=amount))
+
+
 def _particles(config: ControllerConfig, amount: float) -> ControllerConfig:
     def fewer(smc: TemperedSMCConfig) -> TemperedSMCConfig:
         particles, start = (max(2, int(n * amount)) for n in (smc.particles, smc.start_particles))
@@ -161,6 +165,7 @@ def _rays(config: ControllerConfig, amount: float) -> ControllerConfig:
 AXES = (
     Axis("focal length, share", (0.0, 0.02, 0.05, 0.1, 0.2), intrinsics),
     Axis("depth scale, share", (0.0, 0.02, 0.05, 0.1, 0.2), depth_scale),
+    Axis("depth scale that is stated, share", (0.0, 0.02, 0.05, 0.1), depth_scale, _stated),
     Axis("depth noise, m", (0.0, 0.003, 0.01, 0.03), depth_noise),
     Axis("depth holes, share", (0.0, 0.3, 0.6, 0.9), holes),
     Axis("depth absent", (0.0, 1.0), no_depth),
