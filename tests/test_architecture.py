@@ -82,6 +82,8 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     # pictures in a second, before matplotlib is imported; PNG files, resized
     "cv2": ("calibration/*", "perception/*", "node/*/segment*.py", "probnerf/training/srn_dataset.py"),
     "scipy": (
+        "node/figures/object_figure.py",  # morphology
+        "node/figures/voxel_renderer.py",
         "node/ros/messages.py",
         "probnerf/objects/household_parts.py",  # splines
         "probnerf/rendering/occupancy.py",

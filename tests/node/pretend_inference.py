@@ -1,10 +1,16 @@
 """Stands for inference, after the real `observe`: keeps what it was asked, answers with the true mug."""
 
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
+from perception.answers.hypotheses import Hypotheses
 from perception.inference.inference import Estimate
+from perception.inference.limits import Callbacks, Limits
 from perception.inference.settings import ControllerConfig
+from perception.inference.tracker import Change, Look, Tracker, Update
 from perception.observation.rays import observe
 from perception.observation.segmentation import Segment
 from perception.sources.frame import Frame
@@ -36,3 +42,38 @@ class Asked:
             stop=lambda reason: None,
             estimate=lambda: Estimate(h, None, None, None, h.object_frame, 1.5),
         )
+
+
+def pretend_live(
+    monkeypatch: pytest.MonkeyPatch, answers: Callable[[Look], list[Hypotheses]], first: bool = True
+) -> list[Limits]:
+    """Have the node's tracker find these answers to a look: the first of them at once (or not), the rest in one step.
+    The limits that inferences get are returned as they come.
+    """
+    asked: list[Limits] = []
+
+    def begin(self: Tracker, look: Look, limits: Limits, callbacks: Callbacks) -> Any:
+        asked.append(limits)
+        made, hear = answers(look), callbacks.on_answer
+        assert hear is not None
+        inference = SimpleNamespace(done=False, answer=None, interrupted=False, loss=0.0, begin=lambda: None)
+
+        def guess() -> None:
+            if first:
+                inference.answer = made[0]
+                hear(made[0])
+
+        def step(*_: Any) -> bool:
+            for h in made[1:]:
+                hear(h)
+            inference.answer, inference.done = made[-1], True
+            inference.interrupted = made[-1].result == StopReason.INTERRUPTED
+            return True
+
+        inference.guess, inference.step, inference.stop = guess, step, lambda reason: None
+        inference.estimate = lambda: SimpleNamespace(hypotheses=inference.answer)
+        return inference
+
+    monkeypatch.setattr(Tracker, "begin", begin)
+    monkeypatch.setattr(Tracker, "keep", lambda self, look, found: Update(Change.NEW, found.hypotheses, 1, 0.0, 0.0))
+    return asked

@@ -21,13 +21,15 @@ from node.ros.bus import Bus
 from node.ros.messages import HYPOTHESES, NEXT_VIEW, QUERY_REGION, hypotheses_from, make
 from node.ros.settings import BusConfig
 from node.viewer.page import Page
-from perception.inference.tracker import Tracker, Update
+from perception.answers.hypotheses import Hypotheses
+from perception.inference.tracker import Look
 from perception.sources.recording import Log
 from perception.sources.settings import SHIPPED_LOG
 from probnerf.prior.checkpoint import save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from tests.conftest import ROOT
 from tests.node.commands.test_replay_whole import FEW
+from tests.node.pretend_inference import pretend_live
 from tests.node.shapes import body_with_handle, free_port
 
 LAUNCH = ROOT / "launch"
@@ -68,15 +70,13 @@ def test_a_page_shows_what_the_node_infers(
         with urllib.request.urlopen(self.address, timeout=10) as answer:
             shown.append((view.frame.stamp_ns, {h.object_id: h.result for h in scene}, answer.read()))
 
-    def infer(self: Tracker, look: Any, limits: Any, callbacks: Any) -> Update:
+    def found(look: Look) -> list[Hypotheses]:
         stamp = {"stamp_ns": look._view.frame.stamp_ns, "object_id": look.object_id}
-        callbacks.on_answer(body_with_handle(**stamp, result="underway"))
-        callbacks.on_answer(h := body_with_handle(**stamp))
-        return Update("new", h, 4, 0.0, 0.0)
+        return [body_with_handle(**stamp, result="underway"), body_with_handle(**stamp)]
 
     monkeypatch.setattr("node.commands.live.warm_up", lambda _: None)
     monkeypatch.setattr(Page, "show", seen)
-    monkeypatch.setattr(Tracker, "infer", infer)
+    pretend_live(monkeypatch, found)
     save_prior(tmp_path / "tiny.safetensors", ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {})
     (tmp_path / "live.yaml").write_text("bus: {listen: [tcp/127.0.0.1:0]}")
     options = ["--prior", str(tmp_path / "tiny.safetensors"), "--config", str(tmp_path / "live.yaml")]
@@ -84,9 +84,9 @@ def test_a_page_shows_what_the_node_infers(
     said = capsys.readouterr()
     assert f"http://127.0.0.1:{port} shows it" in said.out and not said.err
     assert {stamp for stamp, _, _ in shown} <= {frame.stamp_ns for frame in Log(SHIPPED_LOG)}
-    scenes = [scene for _, scene, _ in shown[:4]]  # of the first frame: each object's first and last answer
-    first, second = "converged", "underway"
-    assert scenes == [{1: second}, {1: first}, {1: first, 2: second}, {1: first, 2: first}]
+    scenes = [scene for _, scene, _ in shown[:4]]  # of the first frame: first answers of all, then the last ones
+    first, last = "underway", "converged"
+    assert scenes == [{1: first}, {1: first, 2: first}, {1: last, 2: first}, {1: last, 2: last}]
     assert all(b"<html" in page for *_, page in shown)
 
 

@@ -19,8 +19,7 @@ from node.commands.config_file import load_config
 from node.commands.live import _Keeper
 from node.commands.options import LiveConfig
 from node.viewer.page import Page
-from perception.inference.limits import Callbacks, Limits
-from perception.inference.tracker import Change, Tracker, Update
+from perception.inference.tracker import Tracker
 from perception.sources.frame import StillSource
 from perception.sources.reader import Reader
 from perception.sources.recorder import Recorder
@@ -30,6 +29,7 @@ from probnerf.prior.checkpoint import save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.types import StopReason
 from tests.conftest import ROOT
+from tests.node.pretend_inference import pretend_live
 from tests.node.shapes import body_with_handle
 
 
@@ -46,17 +46,13 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_ctrl_c_in_the_sampler_ends_the_node(
     run: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    deadlines = []
-
-    def infer(self: Tracker, look: Any, limits: Limits, _: Any) -> Update:
-        deadlines.append(limits.deadline)
-        interrupted = replace(body_with_handle(), result=StopReason.INTERRUPTED)  # as the sampler says it
-        return Update(Change.NEW, interrupted, 1, 0.0, 0.0)
-
-    monkeypatch.setattr(Tracker, "infer", infer)
+    interrupted = replace(body_with_handle(), result=StopReason.INTERRUPTED)  # as the sampler says it
+    asked = pretend_live(monkeypatch, lambda look: [replace(interrupted, object_id=look.object_id)], first=False)
     assert main([*run, "--seconds", "30"]) == 0
     assert "1 inferred" in capsys.readouterr().out
-    assert len(deadlines) == 1 and deadlines[0] <= time.monotonic() + 30.0  # less than the budget of 40 s
+    deadlines = [limits.deadline for limits in asked]
+    assert len(deadlines) == 2 and deadlines[0] is not None and deadlines[0] == deadlines[1]  # both objects' own
+    assert deadlines[0] <= time.monotonic() + 30.0  # less than the budget of 40 s for each
 
 
 def test_a_page_that_cannot_open_leaves_no_recording(
@@ -77,14 +73,8 @@ def test_a_page_that_fails_ends_no_inference(
     def fail(self: Page, scene: Any, view: Any) -> None:
         raise RuntimeError("nothing to draw with")
 
-    def infer(self: Tracker, look: Any, limits: Limits, callbacks: Callbacks) -> Update:
-        h = replace(body_with_handle(), object_id=look.object_id)
-        for _ in range(3):
-            callbacks.on_answer(h)
-        return Update(Change.NEW, h, 1, 0.0, 0.0)
-
     monkeypatch.setattr(Page, "show", fail)
-    monkeypatch.setattr(Tracker, "infer", infer)
+    pretend_live(monkeypatch, lambda look: 3 * [replace(body_with_handle(), object_id=look.object_id)])
     assert main([*run, "--page", "0"]) == 0
     said = capsys.readouterr()
     assert said.err.count("nothing to draw with") == 1 and " 0 inferred" not in said.out
