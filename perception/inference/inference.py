@@ -139,7 +139,7 @@ class Inference:
             self._cut, stop = bool(new) and new[0].result == StopReason.BUDGET and not done, None
         if new:
             self._runs += new
-            answer = publisher.publish_runs(self._runs)
+            answer = publisher.publish_cut(self._runs) if self._cut else publisher.publish_runs(self._runs)
             found = Findings(len(self._runs), answer.diagnostics.expected_loss, 1.0 - answer.diagnostics.explained)
             if self.before is None and self.config.infer.method == "tempered_smc" and stop is None and not self._cut:
                 self._wanted = runs_wanted(found, self.config.runs, self.config.tolerance, self.config.unexplained)
@@ -214,6 +214,11 @@ class _Publisher:
         guess = self.sampler.guess() if self.sampler.asks_network else None
         return self._published(pooled(runs, power), self.config, power, guess)
 
+    def publish_cut(self, runs: list[Posterior]) -> Hypotheses:
+        """The answer of a run that a step's deadline ended, as cheap as an early one."""
+        power = self.sampler.smc.evidence_power
+        return self._published(pooled(runs, power), self._cheaper, power)
+
     def publish_draws(self, draws: Posterior) -> Hypotheses:
         """The answer of weighed draws, whose weights are those of the posterior."""
         return self._published(draws, self.config, 1.0)
@@ -264,11 +269,14 @@ class _Publisher:
     def _particles(self, runs: int) -> str:
         return f"{runs * self.sampler.smc.populations} x {self.sampler.smc.particles} particles"
 
+    @property
+    def _cheaper(self) -> ControllerConfig:
+        return replace(self.config, hypotheses=self.config.first_hypotheses, coarse=self.config.first_coarse)
+
     def _hand_out_early(self, posterior: Posterior) -> Hypotheses:
         """An answer that is cheaper to make."""
-        begun, config = time.monotonic(), self.config
-        cheaper = replace(config, hypotheses=config.first_hypotheses, coarse=config.first_coarse)
-        answer = self._published(posterior, cheaper, self.sampler.smc.evidence_power)
+        begun = time.monotonic()
+        answer = self._published(posterior, self._cheaper, self.sampler.smc.evidence_power)
         self.hand_out(answer)
         self._early_at = time.monotonic()
         self._early_s = self._early_at - begun

@@ -1,5 +1,6 @@
 """All objects of a frame, together, within one budget of time."""
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 
@@ -45,7 +46,9 @@ def _in_rounds(
     segments: Sequence[Segment], start: Callable[[Segment, float | None], Inference], end: float
 ) -> Iterator[Answered]:
     waiting = list[tuple[Segment, Inference]]()
+    answer_s = 0.0  # what the slowest first answer took
     for segment in segments:
+        begun = time.monotonic()
         try:
             inference = start(segment, end)
             inference.guess()
@@ -53,26 +56,31 @@ def _in_rounds(
             yield segment, error
             continue
         waiting.append((segment, inference))
+        answer_s = max(answer_s, time.monotonic() - begun)
     interrupted = False
-    for i, (_, inference) in enumerate(waiting):
+    given = dict[int, float]()  # seconds of each first run, at most
+    for i, (segment, inference) in enumerate(waiting):
         now = time.monotonic()
-        share = (end - now) / (len(waiting) - i)
+        share = given[segment.id] = (end - now) / (len(waiting) - i)
         if interrupted or (share <= 0.0 and inference.answer is not None):
             continue
         inference.begin()
         if not inference.done:
-            inference.step(1, now + max(share, 1.0))
+            inference.step(1, now + max(share - answer_s, 0.5))
         interrupted = inference.interrupted
     while not interrupted and waiting:
         for segment, inference in [pair for pair in waiting if pair[1].done]:
             waiting.remove((segment, inference))
             yield segment, inference.estimate()
-        if waiting and time.monotonic() < end:
-            chosen = max((inference for _, inference in waiting), key=lambda inference: inference.loss)
-            chosen.step(1)
-            interrupted = chosen.interrupted
-        else:
+        left = end - time.monotonic()
+        # a run that was cut is made anew only where it may get as far
+        need = [0.75 * max(given[segment.id], 0.0) if it.loss == math.inf else 0.0 for segment, it in waiting]
+        open_to = [it for (_, it), seconds in zip(waiting, need, strict=True) if left > seconds]
+        if not open_to:
             break
+        chosen = max(open_to, key=lambda inference: inference.loss)
+        chosen.step(1)
+        interrupted = chosen.interrupted
     for segment, inference in waiting:
         inference.stop(StopReason.INTERRUPTED if interrupted else StopReason.BUDGET)
         if inference.answer is not None:
