@@ -134,7 +134,7 @@ def test_runs_that_are_cut_are_answers_where_there_is_no_time_for_more(monkeypat
     scene = Scene(monkeypatch, [0.0], [0.0], cost=9.0)
     found = scene.answers(17.0)  # both have 8 s of 9
     assert scene.diary[2:] == ["1 begins", "1 is cut", "2 begins", "2 is cut"] and scene.clock.now <= 17.0
-    assert [(name, e.answer) for name, e in found] == [(2, "shapes"), (1, "shapes")]
+    assert [(name, e.answer) for name, e in found] == [(1, "shapes"), (2, "shapes")]
 
 
 def test_without_time_for_runs_the_first_answers_stand(monkeypatch: pytest.MonkeyPatch) -> None:
