@@ -215,9 +215,9 @@ class _Publisher:
         return self._published(pooled(runs, power), self.config, power, guess)
 
     def publish_cut(self, runs: list[Posterior]) -> Hypotheses:
-        """The answer of a run that a step's deadline ended, as cheap as an early one."""
-        power = self.sampler.smc.evidence_power
-        return self._published(pooled(runs, power), self._cheaper, power)
+        """The answer of a run that a step's deadline ended: as many shapes, as coarse as early ones."""
+        power, config = self.sampler.smc.evidence_power, self.config
+        return self._published(pooled(runs, power), replace(config, coarse=config.first_coarse), power)
 
     def publish_draws(self, draws: Posterior) -> Hypotheses:
         """The answer of weighed draws, whose weights are those of the posterior."""
@@ -269,14 +269,11 @@ class _Publisher:
     def _particles(self, runs: int) -> str:
         return f"{runs * self.sampler.smc.populations} x {self.sampler.smc.particles} particles"
 
-    @property
-    def _cheaper(self) -> ControllerConfig:
-        return replace(self.config, hypotheses=self.config.first_hypotheses, coarse=self.config.first_coarse)
-
     def _hand_out_early(self, posterior: Posterior) -> Hypotheses:
         """An answer that is cheaper to make."""
-        begun = time.monotonic()
-        answer = self._published(posterior, self._cheaper, self.sampler.smc.evidence_power)
+        begun, config = time.monotonic(), self.config
+        cheaper = replace(config, hypotheses=config.first_hypotheses, coarse=config.first_coarse)
+        answer = self._published(posterior, cheaper, self.sampler.smc.evidence_power)
         self.hand_out(answer)
         self._early_at = time.monotonic()
         self._early_s = self._early_at - begun
