@@ -21,6 +21,7 @@ ORDER = {
     "The prior": ("prior",),
     "Unseen space": ("calibration", "handle", "hidden"),
     "Real frames": ("real", "segmentation"),
+    "Scenes": ("scene",),
     "Strangers": ("out_of_model", "strangers", "kinds"),
     "The sampler alone": ("sbc", "chains", "acceptance"),
     "What it is worth to a planner": ("reach", "query", "next_view"),

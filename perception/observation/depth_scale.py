@@ -36,5 +36,5 @@ def scale_doubt(frame: Frame, plane: Float[np.ndarray, "4"], guess: PlaneGuess) 
     return (
         f"depth shows the camera {seen:.3f} m above the plane that objects stand on, {source} it is {known:.3f} m: "
         f"depth is {abs(error):.0f}% too {'long' if error > 0 else 'short'}, or the height is wrong; calibrate the "
-        "depth, or state its relative error (observe.depth_scale_sigma)"
+        "depth, or state its relative error (controller.observe.depth_scale_sigma)"
     )
