@@ -75,7 +75,7 @@ MUTATIONS = {
         "tests/properties/test_samples.py::test_no_as_many_equal_samples",
     ),
     "a foot judged by the noise of 1 m": Mutation(
-        "perception/observation/segmentation.py",
+        "perception/observation/standing.py",
         "config.base * growth",
         "config.base",
         "tests/perception/observation/test_segmentation.py::test_what_belongs_to_a_foot",
