@@ -2,7 +2,8 @@
 
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -61,7 +62,7 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
         answered = estimate_scene(segments, start, deadline, PICTURE_S)
         for found, result in _saved_if_interrupted(answered, config.folder, written):
             progress.finished(found.id)
-            with progress.hidden():
+            with progress.hidden(), _rest_saved(answered, config.folder):
                 if isinstance(result, ValueError):
                     if len(segments) > 1:
                         err.print(f"object {found.id} is left out: {result}", highlight=False, soft_wrap=True)
@@ -82,16 +83,32 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
     return all(h.result != StopReason.INTERRUPTED for h in done)
 
 
+@contextmanager
+def _rest_saved(answered: Generator[Answered, None, None], folder: Path) -> Iterator[None]:
+    """A Ctrl-C within: the present answers of the objects that are still to come are saved before it ends the job."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        with suppress(StopIteration, KeyboardInterrupt):
+            _save([answered.throw(error), *answered], folder)
+        raise
+
+
+def _save(answers: Iterable[Answered], folder: Path) -> set[Path]:
+    written = set()
+    for found, result in answers:
+        if not isinstance(result, ValueError):
+            save(hypotheses_path(folder, found.id), result.hypotheses)
+            written.add(hypotheses_path(folder, found.id))
+    return written
+
+
 def _saved_if_interrupted(answered: Iterator[Answered], folder: Path, written: set[Path]) -> Iterator[Answered]:
     """The same; after a Ctrl-C all that follows is saved first, before anything is drawn, and added to `written`."""
     for found, result in answered:
         if not isinstance(result, ValueError) and result.hypotheses.result == StopReason.INTERRUPTED:
             rest = [(found, result), *answered]
-            for other, estimate in rest:
-                if not isinstance(estimate, ValueError):
-                    path = hypotheses_path(folder, other.id)
-                    save(path, estimate.hypotheses)
-                    written.add(path)
+            written |= _save(rest, folder)
             yield from rest
             return
         yield found, result

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 
 from perception.inference.inference import Estimate, Inference
 from perception.observation.segmentation import Segment
@@ -16,14 +16,14 @@ def estimate_scene(
     start: Callable[[Segment, float | None], Inference],
     deadline: float | None = None,
     kept_back_s: float = 0.0,
-) -> Iterator[Answered]:
+) -> Generator[Answered, None, None]:
     """Each segment's estimate as soon as it is done, or the reason why there is none.
 
     Without a `deadline` (of `time.monotonic`) one object is finished after the other. With one, all objects get their
     first answers; then each a first run of the sampler, in its share of the time that is left; then the object whose
     unseen space may gain most (`Inference.loss`) gets a run, as long as there is room. At the end every object has the
     best answer that there was time for. `start` makes an inference that ends at a time. `kept_back_s` is what the
-    caller spends on each answer. After Ctrl-C all present answers are given.
+    caller spends on each answer. After Ctrl-C, also one that is thrown in, all present answers are given.
     """
     if deadline is not None and len(segments) > 1:
         yield from _in_rounds(segments, start, deadline - kept_back_s * len(segments))
@@ -35,8 +35,13 @@ def estimate_scene(
         except ValueError as error:
             yield segment, error
             continue
-        while not inference.done:
-            inference.step()
+        try:
+            while not inference.done:
+                inference.step()
+        except KeyboardInterrupt:
+            if inference.answer is None:
+                raise
+            inference.stop(StopReason.INTERRUPTED)
         yield segment, inference.estimate()
         if inference.interrupted:
             return
@@ -44,9 +49,29 @@ def estimate_scene(
 
 def _in_rounds(
     segments: Sequence[Segment], start: Callable[[Segment, float | None], Inference], end: float
-) -> Iterator[Answered]:
+) -> Generator[Answered, None, None]:
     waiting = list[tuple[Segment, Inference]]()
-    answer_s = 0.0  # what the slowest first answer took
+    reason = StopReason.BUDGET
+    try:
+        answer_s = yield from _first_answers(segments, start, end, waiting)
+        if (yield from _runs(waiting, end, answer_s)):
+            reason = StopReason.INTERRUPTED
+    except KeyboardInterrupt:  # between two stages of the sampler, which takes note of others itself
+        reason = StopReason.INTERRUPTED
+    for segment, inference in waiting:
+        inference.stop(reason)
+        if inference.answer is not None:
+            yield segment, inference.estimate()
+
+
+def _first_answers(
+    segments: Sequence[Segment],
+    start: Callable[[Segment, float | None], Inference],
+    end: float,
+    waiting: list[tuple[Segment, Inference]],
+) -> Generator[Answered, None, float]:
+    """Puts objects with their first answers on the list. The time that the slowest took, s."""
+    answer_s = 0.0
     for segment in segments:
         begun = time.monotonic()
         try:
@@ -57,18 +82,23 @@ def _in_rounds(
             continue
         waiting.append((segment, inference))
         answer_s = max(answer_s, time.monotonic() - begun)
-    interrupted = False
+    return answer_s
+
+
+def _runs(waiting: list[tuple[Segment, Inference]], end: float, answer_s: float) -> Generator[Answered, None, bool]:
+    """Takes what is done off the list. Whether Ctrl-C ended it."""
     given = dict[int, float]()  # seconds of each first run, at most
     for i, (segment, inference) in enumerate(waiting):
         now = time.monotonic()
         share = given[segment.id] = (end - now) / (len(waiting) - i)
-        if interrupted or (share <= 0.0 and inference.answer is not None):
+        if share <= 0.0 and inference.answer is not None:
             continue
         inference.begin()
         if not inference.done:
             inference.step(1, now + max(share - answer_s, 0.5))
-        interrupted = inference.interrupted
-    while not interrupted and waiting:
+        if inference.interrupted:
+            return True
+    while waiting:
         for segment, inference in [pair for pair in waiting if pair[1].done]:
             waiting.remove((segment, inference))
             yield segment, inference.estimate()
@@ -80,8 +110,6 @@ def _in_rounds(
             break
         chosen = max(open_to, key=lambda inference: inference.loss)
         chosen.step(1)
-        interrupted = chosen.interrupted
-    for segment, inference in waiting:
-        inference.stop(StopReason.INTERRUPTED if interrupted else StopReason.BUDGET)
-        if inference.answer is not None:
-            yield segment, inference.estimate()
+        if chosen.interrupted:
+            return True
+    return False

@@ -127,6 +127,19 @@ def test_ctrl_c_keeps_what_is_there(folder: Path, tmp_path: Path, prior: Path, a
     assert {h.result for h in load_scene(out)} == {"interrupted"}
 
 
+@pytest.mark.usefixtures("asked")
+def test_ctrl_c_while_a_picture_is_drawn_keeps_what_is_there(
+    folder: Path, tmp_path: Path, prior: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("node.commands.replay.draw_object", interrupted)
+    out = tmp_path / "out"
+    assert main(["replay", str(folder), "--prior", str(prior), "--out", str(out)]) == 130
+    assert sorted(p.name for p in out.glob("object_*")) == ["object_1.npz", "object_2.npz"]
+
+
 def test_a_recording_gives_the_asked_frame(
     tmp_path: Path, frame: Frame, prior: Path, asked: Asked, capsys: pytest.CaptureFixture
 ) -> None:

@@ -11,6 +11,8 @@ import perception.inference.scene
 from perception.inference.scene import estimate_scene
 from probnerf.types import StopReason
 
+INTERRUPTED = StopReason.INTERRUPTED
+
 
 @dataclass
 class Clock:
@@ -166,3 +168,25 @@ def test_ctrl_c_gives_all_present_answers(monkeypatch: pytest.MonkeyPatch) -> No
     ]
     one = Scene(monkeypatch, [0.0], [0.0], interrupts=True)
     assert [name for name, _ in one.answers(None)] == [1]
+
+
+def test_ctrl_c_between_stages_or_outside_gives_all_present_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = Scene(monkeypatch, [0.3, 0.0], [0.0], [0.0])
+
+    def step(self: Inference, *_: Any) -> bool:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Inference, "step", step)
+        found = scene.answers(100.0)
+        assert [(name, e.answer, e.reason) for name, e in found] == [(i, "guess", INTERRUPTED) for i in (1, 2, 3)]
+        with pytest.raises(KeyboardInterrupt):
+            one = Scene(patched, [0.0])
+            one.answers(None)  # nothing is there yet
+    again = Scene(monkeypatch, [0.3, 0.0], [0.0], [0.0])
+    segments: Any = [SimpleNamespace(id=i) for i in (1, 2, 3)]
+    answers: Any = estimate_scene(segments, again.start, 100.0)
+    first = next(answers)[0].id  # it is drawn meanwhile, say
+    rest = [answers.throw(KeyboardInterrupt()), *answers]
+    assert [first, *(s.id for s, _ in rest)] == [2, 1, 3]
+    assert [(e.answer, e.reason) for _, e in rest] == [("shapes", INTERRUPTED), ("shapes", None)]  # 3 was done
