@@ -5,6 +5,7 @@ import re
 import time
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import jax
 import numpy as np
@@ -131,10 +132,7 @@ def test_ctrl_c_keeps_what_is_there(folder: Path, tmp_path: Path, prior: Path, a
 def test_ctrl_c_while_a_picture_is_drawn_keeps_what_is_there(
     folder: Path, tmp_path: Path, prior: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("node.commands.replay.draw_object", interrupted)
+    monkeypatch.setattr("node.commands.replay.draw_object", Mock(side_effect=KeyboardInterrupt))
     out = tmp_path / "out"
     assert main(["replay", str(folder), "--prior", str(prior), "--out", str(out)]) == 130
     assert sorted(p.name for p in out.glob("object_*")) == ["object_1.npz", "object_2.npz"]
