@@ -90,7 +90,9 @@ def _rest_saved(answered: Generator[Answered, None, None], folder: Path) -> Iter
         yield
     except KeyboardInterrupt as error:
         with suppress(StopIteration, KeyboardInterrupt):
-            _save([answered.throw(error), *answered], folder)
+            _save([answered.throw(error)], folder)
+            for one in answered:
+                _save([one], folder)
         raise
 
 

@@ -23,7 +23,8 @@ def estimate_scene(
     first answers; then each a first run of the sampler, in its share of the time that is left; then the object whose
     unseen space may gain most (`Inference.loss`) gets a run, as long as there is room. At the end every object has the
     best answer that there was time for. `start` makes an inference that ends at a time. `kept_back_s` is what the
-    caller spends on each answer. After Ctrl-C, also one that is thrown in, all present answers are given.
+    caller spends on each answer. After Ctrl-C, also one that is thrown in, all present answers are given; where none of
+    them says so, KeyboardInterrupt is raised then.
     """
     if deadline is not None and len(segments) > 1:
         yield from _in_rounds(segments, start, deadline - kept_back_s * len(segments))
@@ -51,17 +52,20 @@ def _in_rounds(
     segments: Sequence[Segment], start: Callable[[Segment, float | None], Inference], end: float
 ) -> Generator[Answered, None, None]:
     waiting = list[tuple[Segment, Inference]]()
-    reason = StopReason.BUDGET
+    reason, caught = StopReason.BUDGET, False
     try:
         answer_s = yield from _first_answers(segments, start, end, waiting)
         if (yield from _runs(waiting, end, answer_s)):
             reason = StopReason.INTERRUPTED
     except KeyboardInterrupt:  # between two stages of the sampler, which takes note of others itself
-        reason = StopReason.INTERRUPTED
+        reason, caught = StopReason.INTERRUPTED, True
     for segment, inference in waiting:
         inference.stop(reason)
         if inference.answer is not None:
+            caught = caught and not inference.interrupted  # the answer says so
             yield segment, inference.estimate()
+    if caught:
+        raise KeyboardInterrupt
 
 
 def _first_answers(

@@ -190,3 +190,22 @@ def test_ctrl_c_between_stages_or_outside_gives_all_present_answers(monkeypatch:
     rest = [answers.throw(KeyboardInterrupt()), *answers]
     assert [first, *(s.id for s, _ in rest)] == [2, 1, 3]
     assert [(e.answer, e.reason) for _, e in rest] == [("shapes", INTERRUPTED), ("shapes", None)]  # 3 was done
+
+
+def test_ctrl_c_is_told_where_no_answer_can_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before the first of all answers, and where all objects that are left are done."""
+
+    def guess(self: Inference) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Inference, "guess", guess)
+        with pytest.raises(KeyboardInterrupt):
+            Scene(patched, [0.0], [0.0]).answers(100.0)
+    done = Scene(monkeypatch, [0.0], [0.0])
+    segments: Any = [SimpleNamespace(id=i) for i in (1, 2)]
+    answers: Any = estimate_scene(segments, done.start, 100.0)
+    assert next(answers)[0].id == 1
+    assert answers.throw(KeyboardInterrupt())[0].id == 2
+    with pytest.raises(KeyboardInterrupt):
+        next(answers)
