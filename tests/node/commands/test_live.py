@@ -133,7 +133,9 @@ def test_a_driver_the_node_and_a_planner_in_three_processes(tmp_path: Path) -> N
                 asked = make(f"{QUERY_REGION}_Request", kind=1, points=np.array([0.0, 0.0, 0.4, 0.0, 0.0, 0.7]))
                 asked.header.frame_id = "camera"
                 response = wait_for(planner, "/farside/query_region", QUERY_REGION, asked)
-                assert np.isnan(response.p_free) == (response.outside_fraction == 1.0) and len(response.p_occupied) == 2
+                nowhere = response.outside_fraction == 1.0  # outside of both objects' cubes
+                assert np.isnan(response.p_free) if nowhere else 0.0 <= response.p_free <= 1.0
+                assert len(response.p_occupied) == 2
                 assert response.objects >= 1 and response.age < 100.0
                 views = make(f"{NEXT_VIEW}_Request", count=3)
                 views.header.frame_id = "camera"
