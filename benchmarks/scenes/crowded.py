@@ -6,16 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from benchmarks.scenes.vessels import ViewConfig, simulated_camera
+from benchmarks.scenes.vessels import ViewConfig, simulated_camera, stand
 from perception.simulation.sensor_faults import sense
-from perception.simulation.simulated_camera import PlacedObject, TableScene, place_camera, render, truth
+from perception.simulation.simulated_camera import PlacedObject, TableScene, render, truth
 from perception.sources.frame import Frame
 from probnerf.objects.tabletop import TEST_SEEDS, signed_distance
 from probnerf.types import BASE_Z, BODY_EXTENT
 
 AREA = (0.28, 0.42)  # m, half sides of the part of the table that they stand on
 GAP = 0.01  # m between the circles that bodies stand in
-ELEVATION, DISTANCE = (30.0, 50.0), (1.0, 1.2)  # degrees above the table, m from the middle of the things
+VIEW = ViewConfig(elevation=(30.0, 50.0), distance=(1.0, 1.2), aim=0.0)  # of the middle of the things
 LEAST = 500  # px of a thing in sight, without which it is not asked for
 MARGIN, BEHIND, DRAWN, SCORED = 0.03, 0.005, 20_000, 2000  # m about its box, m behind what is seen; points
 
@@ -46,11 +46,8 @@ def crowd(seed: int, count: int = 10) -> Crowd:
                 placed.append(thing)
                 break
     scene = TableScene(tuple(placed))
-    azimuth, elevation = rng.uniform(-0.3, 0.3), np.deg2rad(rng.uniform(*ELEVATION))  # it faces the wall
-    towards = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
-    middle = np.array([0.0, 0.0, 0.05])
-    T_world_camera = place_camera(tuple(middle + rng.uniform(*DISTANCE) * towards), tuple(middle))
-    camera = simulated_camera(ViewConfig())
+    T_world_camera = stand(np.array([0.0, 0.0, 0.05]), 0.0, rng, VIEW)
+    camera = simulated_camera(VIEW)
     picture = render(scene, camera, T_world_camera)
     frame = sense(picture, camera, T_world_camera, seed)
     assert frame.label is not None
@@ -80,11 +77,7 @@ def hidden_points(made: Crowd, object_id: int) -> tuple[Float[np.ndarray, "n 3"]
     inside = np.all((px >= 0) & (px < [camera.width, camera.height]), axis=1)
     u, v = np.where(inside[:, None], px, 0).astype(int).T
     keep = np.flatnonzero(inside & (points[:, 2] >= made.depth[v, u] + BEHIND))[:SCORED]
-    return points[keep], _inside(placed, cube[keep])
-
-
-def _inside(placed: PlacedObject, cube: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-    return np.asarray(signed_distance(placed.shape, jnp.asarray(cube))) <= 0.0
+    return points[keep], np.asarray(signed_distance(placed.shape, jnp.asarray(cube[keep]))) <= 0.0
 
 
 def _box(placed: PlacedObject) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
