@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from perception.observation.colour_masks import label_colour
 from perception.observation.depth_scale import scale_doubt
+from perception.observation.depth_shadows import by_colour
 from perception.observation.settings import SegmentConfig
 from perception.observation.standing import candidates, in_box, standing
 from perception.observation.support_plane import heights, horizontal, noise_growth, support_of
@@ -71,7 +72,8 @@ def segment(frame: Frame, object_id: int | None = None, config: SegmentConfig | 
 
     With a box (`MaskConfig`) the thing in it is object 1. With a label map its ids are the objects. Without either,
     points above the supports (`standing`) are clustered and numbered from the largest; what is too large, too low or
-    cut off by the picture's border is left out. Statuses per object: OBJECT in its mask. FREE where the ray is known to
+    cut off by the picture's border is left out; pixels without depth beside it are its own if they look like it
+    (`by_colour`). Statuses per object: OBJECT in its mask. FREE where the ray is known to
     miss it: the depth there is on or below the support plane, or beyond the object, or absent where the label map says
     background. UNKNOWN otherwise: nearer things, pixels without depth, the rim of the mask, mask pixels whose depth is
     the background's.
@@ -129,14 +131,19 @@ def _segment_depth(frame: Frame, object_id: int | None, config: SegmentConfig) -
     if object_id is not None and object_id not in found:
         why = [f"object {it.id} is left out: {it.reason}" for it in left if it.id == object_id]
         raise ValueError(*why or [f"no object {object_id}; its objects: {', '.join(map(str, found))}"])
+    seen = np.isfinite(points[..., 2])
+    alike = dict.fromkeys(found, np.zeros_like(seen))
+    if label is None:
+        alike = dict(zip(found, by_colour(frame.rgb, [mask for mask, _ in found.values()], seen), strict=True))
     segments = []
     for i, (mask, plane) in found.items():
         if object_id not in (None, i):
             continue
-        pixels, measured = int(mask.sum()), int((mask & np.isfinite(points[..., 2])).sum())
+        pixels, measured = int(mask.sum()), int((mask & seen).sum())
         if measured >= config.min_pixels:
             own = _own_plane(points, plane, mask, config)
-            segments.append(Segment(i, mask, own, *_statuses(points, own, mask, label, config)))
+            statuses = _statuses(points, own, mask | alike[i], label, alike[i], config)
+            segments.append(Segment(i, mask | alike[i], own, *statuses))
             continue
         reason = f"{pixels} pixels, {measured} of them with depth; at least {config.min_pixels} are needed"
         if i == object_id or len(found) == 1:
@@ -271,9 +278,13 @@ def _statuses(
     plane: Float[np.ndarray, "4"],
     mask: Bool[np.ndarray, "h w"],
     label: Int[np.ndarray, "h w"] | None,
+    alike: Bool[np.ndarray, "h w"],
     config: SegmentConfig,
 ) -> tuple[Int[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """The status of each pixel for one object, and which of the UNKNOWN ones see something else."""
+    """The status of each pixel for one object, and which of the UNKNOWN ones see something else.
+
+    `alike`: the mask's pixels without depth that are the object's by their colour.
+    """
     distance, height = np.linalg.norm(points, axis=-1), heights(points, plane) / noise_growth(points)
     measured = np.isfinite(distance)
     body = points[mask & measured & (height > config.base)]
@@ -286,7 +297,7 @@ def _statuses(
     status = np.full(mask.shape, UNKNOWN, np.int32)
     status[~mask & measured & ((height <= config.above) | (distance > far))] = FREE
     if label is None:
-        status[mask & measured & ~elsewhere] = OBJECT  # filled holes are a guess
+        status[mask & measured & ~elsewhere | alike] = OBJECT  # other filled holes are a guess
     else:
         status[mask & ~elsewhere] = OBJECT
         status[~measured & (label == 0)] = FREE

@@ -113,9 +113,9 @@ def test_what_pixels_say_of_a_can_alone(label: bool) -> None:
     assert (s.status[~truth & far_from_outline & known] == FREE).mean() > 0.97
     outline = s.mask ^ ndimage.binary_erosion(s.mask)
     assert (s.status[outline] == UNKNOWN).all() and not s.occluder[outline].any()
-    # Where there is no depth, only a label map can tell.
+    # Where there is no depth, colour can tell what is its own, and only a label map what is not.
     blind = ~known & far_from_outline
-    assert (s.status[blind & truth] == (OBJECT if label else UNKNOWN)).all()
+    assert (s.status[blind & truth] == OBJECT).all()
     assert (s.status[blind & ~truth] == (FREE if label else UNKNOWN)).all()
     assert not s.occluder[~known].any()
 
