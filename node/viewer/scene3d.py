@@ -195,16 +195,23 @@ def first_box(placed: PageScene, unseen: Cloud) -> tuple[Float[np.ndarray, "3"],
     """Centre and size (m) of an informative first box: around space that about half of the hypotheses occupy. Both are
     rounded to millimetres.
     """
-    side = 0.3 * placed.objects[0].object_frame.half_extent
-    size = np.maximum(np.round(np.full(3, side), 3), 1e-3)
+    sides = [share * placed.objects[0].object_frame.half_extent for share in (0.3, 0.15, 0.075)]
+    sizes = [np.maximum(np.round(np.full(3, side), 3), 1e-3) for side in sides]
     if not len(unseen.points):
-        return np.round(placed.T_page_object(placed.objects[0])[:3, 3], 3), size
+        return np.round(placed.T_page_object(placed.objects[0])[:3, 3], 3), sizes[0]
     split = unseen.points[unseen.disagreement >= 0.5 * unseen.disagreement.max()]
     tried = np.round(split[:: max(1, len(split) // 40)], 3)
-    answers = [ask(placed, point, size) for point in tried]
-    odds = np.nan_to_num([answer.p_free for answer in answers], nan=1.0)
-    best = min(range(len(tried)), key=lambda i: (answers[i].outside_fraction > 0, abs(odds[i] - 0.5)))
-    return tried[best], size
+    best: tuple[tuple[bool, float], Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None
+    for size in sizes:  # a smaller one where a wall that all agree on is in every larger one
+        for point in tried:
+            answer = ask(placed, point, size)
+            worth = (answer.outside_fraction > 0, abs(float(np.nan_to_num(answer.p_free, nan=1.0)) - 0.5))
+            if best is None or worth < best[0]:
+                best = (worth, point, size)
+        if best is not None and best[0] < (False, 0.3):
+            break
+    assert best is not None
+    return best[1:]
 
 
 def seen_surface(placed: PageScene, view: CameraView) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
