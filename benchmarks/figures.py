@@ -5,6 +5,7 @@ import importlib
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,6 +16,7 @@ from benchmarks.harness.progress import say
 from benchmarks.harness.results import FOLDER, Line, newest, read_lines
 from benchmarks.harness.study import Summary, kept_tables
 from benchmarks.harness.tables import Table
+from probnerf.prior.checkpoint import load_prior
 
 PAGE = ROOT / "docs" / "figures.md"
 ORDER = {
@@ -29,6 +31,8 @@ ORDER = {
     "Speed": ("kernel", "frontier", "effort", "startup"),
     "The node": ("ingest", "bus", "record"),
 }
+TABLETOP = ROOT / "benchmarks" / "checkpoints" / "tabletop" / "prior.safetensors"
+PRIORS = {None: "The shipped prior", TABLETOP: "The prior before, of tabletop objects alone"}
 TOGETHER = {"ingest": "node"}  # studies that today's transcription shows in one table, and its name
 INTRODUCTION = """# All figures
 
@@ -109,10 +113,30 @@ def _section(name: str, transcription: dict[str, Any], drawn: Callable[[str, Sum
 
 
 def _measured(name: str, lines: list[Line], drawn: Callable[[str, Summary], None] | None) -> list[str]:
-    """Tables of a study that has rows, of the last prior in its file, and where its rows are from."""
+    """Tables of a study that has rows, of each prior in its file, the last one first, and where its rows are from."""
+    priors = list(dict.fromkeys(line["prior"] for line in reversed(lines) if line["prior"]))
+    if name == "sbc":
+        return _of_prior(name, [line for line in lines if line["prior"] in (priors[0], "")], drawn)
+    found: list[str] = []
+    for prior in priors:
+        if len(priors) > 1:
+            found.append(f"#### {_named(prior)}\n")
+        found += _of_prior(name, newest(lines, prior), drawn if prior == priors[0] else None)
+    return found
+
+
+def _named(prior: str) -> str:
+    """A heading for the rows of a prior, by its identity."""
+    return _names().get(prior, f"Another prior, {prior[:8]}")
+
+
+@cache
+def _names() -> dict[str, str]:
+    return {load_prior(path).identity: words for path, words in PRIORS.items()}
+
+
+def _of_prior(name: str, same: list[Line], drawn: Callable[[str, Summary], None] | None) -> list[str]:
     study = importlib.import_module(f"benchmarks.studies.{name}")
-    prior = next(line["prior"] for line in reversed(lines) if line["prior"])
-    same = [line for line in lines if line["prior"] in (prior, "")] if name == "sbc" else newest(lines, prior)
     found: list[str] = []
     for options in (study.Options(), *getattr(study, "ALSO", ())):
         summary = study.summary(same, options)

@@ -201,17 +201,15 @@ def first_box(placed: PageScene, unseen: Cloud) -> tuple[Float[np.ndarray, "3"],
         return np.round(placed.T_page_object(placed.objects[0])[:3, 3], 3), sizes[0]
     split = unseen.points[unseen.disagreement >= 0.5 * unseen.disagreement.max()]
     tried = np.round(split[:: max(1, len(split) // 40)], 3)
-    best: tuple[tuple[bool, float], Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None
+    best, size = 0, sizes[0]
     for size in sizes:  # a smaller one where a wall that all agree on is in every larger one
-        for point in tried:
-            answer = ask(placed, point, size)
-            worth = (answer.outside_fraction > 0, abs(float(np.nan_to_num(answer.p_free, nan=1.0)) - 0.5))
-            if best is None or worth < best[0]:
-                best = (worth, point, size)
-        if best is not None and best[0] < (False, 0.3):
+        answers = [ask(placed, point, size) for point in tried]
+        odds = np.nan_to_num([answer.p_free for answer in answers], nan=1.0)
+        worth = [(answer.outside_fraction > 0, abs(p - 0.5)) for answer, p in zip(answers, odds, strict=True)]
+        best = min(range(len(tried)), key=lambda i: worth[i])
+        if worth[best] < (False, 0.3):
             break
-    assert best is not None
-    return best[1:]
+    return tried[best], size
 
 
 def seen_surface(placed: PageScene, view: CameraView) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
