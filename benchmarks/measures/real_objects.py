@@ -74,10 +74,16 @@ def near_points(
     return points[clear & (heights(points, plane) > 0) & is_hidden(frame, points)]
 
 
-def hidden_surface(frame: Frame, own: TrueObject) -> Float[np.ndarray, "n 3"]:
-    """Points (camera frame, m) of an object's surface at least 10 mm behind the measured depth."""
+def hidden_surface(
+    frame: Frame, plane: Float[np.ndarray, "4"], own: TrueObject
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
+    """Points (camera frame, m) of an object's surface at least 10 mm behind the measured depth: those above the plane,
+    and those in the table. Nothing is in the table; there the true pose and the measured depth contradict each other.
+    """
     surface = own.in_camera
-    return surface[is_hidden(frame, surface)]
+    hidden = surface[is_hidden(frame, surface)]
+    above = heights(hidden, plane) > 0
+    return hidden[above], hidden[~above]
 
 
 def chamfer_mm(h: Hypotheses, own: TrueObject) -> float:

@@ -47,4 +47,6 @@ def test_points_near_the_hidden_surface_are_outside_of_it(shared_data):
     gap = np.linalg.norm(near[::20, None] - surface[None], axis=-1).min(axis=1)
     assert len(near) > 100 and gap.min() > 0.003 and gap.max() < 0.016
     assert (Delaunay(surface).find_simplex(near) < 0).mean() > 0.97  # a can is convex
-    assert is_hidden(frame, hidden_surface(frame, truth[1])).all()
+    above, in_table = hidden_surface(frame, plane, truth[1])
+    assert is_hidden(frame, np.concatenate([above, in_table])).all()
+    assert heights(above, plane).min() > 0 > heights(in_table, plane).max()
