@@ -8,6 +8,7 @@ import numpy as np
 import yaml
 
 from calibration.camera import Camera
+from foundation.bounded import check_size
 from foundation.one_line import one_line
 from foundation.whole_file import write_whole
 
@@ -48,9 +49,10 @@ def read_camera(path: Path) -> Camera:
     """The camera in a YAML file of ROS's or ours. Raises FileNotFoundError, or ValueError naming file and remedy."""
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        check_size(content)
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise FileNotFoundError(f"{path}: no such camera file; `farside calibrate` writes one") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not YAML ({one_line(error)}); calibrate again") from None
     try:
         if not isinstance(content, Mapping):
@@ -67,7 +69,7 @@ def read_camera(path: Path) -> Camera:
             distortion_std=None if distortion_std is None else _array(ours, "distortion_std").ravel(),
             rms=None if rms is None else float(rms),
         )
-    except (AttributeError, TypeError, ValueError) as error:
+    except (AttributeError, OverflowError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is no camera file: {error}; calibrate again") from None
 
 

@@ -242,6 +242,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             message = f"{error.filename}: {error.strerror}; check this path, and that it may be read or written"
         print(f"farside: error: {' '.join(message.split())}", file=sys.stderr)
         return 1
+    except Exception as error:  # a fault of this program, or input that no reader expected
+        if "--debug" in arguments:
+            raise
+        what = "not enough memory" if isinstance(error, MemoryError) else f"{type(error).__name__}: {error}"
+        asked = " ".join([args[0], *(a for a in args[1:] if os.path.exists(a))])
+        what = " ".join(what.split())[:300]
+        print(f"farside: error: {asked}: {what}; check these files, or see more with --debug", file=sys.stderr)
+        return 1
     except KeyboardInterrupt as error:
         if "--debug" in arguments:
             raise

@@ -16,6 +16,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.constructor import DuplicateKeyError
 from ruamel.yaml.error import YAMLError
 
+from foundation.bounded import check_size
 from foundation.one_line import one_line
 
 T = TypeVar("T")
@@ -38,13 +39,14 @@ def load_config(path: Path, into: type[T]) -> T:
     """
     try:
         values = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+        check_size(values)
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise FileNotFoundError(f"{path}: no such configuration file; see launch/replay.yaml for one") from None
     except DuplicateKeyError as error:
         assert error.problem is not None and error.problem_mark is not None
         where = f"line {error.problem_mark.line + 1}: {error.problem}"
         raise ValueError(f"{path} is not YAML ({where}; omit one of them)") from None
-    except (YAMLError, UnicodeDecodeError) as error:
+    except (YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not YAML ({one_line(error)})") from None
     try:
         return from_mapping(into, {} if values is None else values)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from foundation.bounded import check_arrays, parse_json
 from foundation.whole_file import whole_file
 from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
@@ -103,6 +104,7 @@ def load(path: str | Path) -> Hypotheses:
         )
     damaged = f"{path} is damaged ({{}}); write it again with `farside replay`"
     try:
+        check_arrays(path)
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError) as error:
@@ -137,10 +139,11 @@ def load_scene(path: str | Path) -> list[Hypotheses]:
 def _header(path: Path, arrays: dict[str, np.ndarray]) -> dict:
     """The JSON header, its format checked."""
     try:
-        header = json.loads(arrays["header"].tobytes())
+        header = parse_json(arrays["header"].tobytes())
+        assert isinstance(header, dict)
         name = header["format"]
         prefix, version = name[: len(FORMAT)], int(name[len(FORMAT) :])
-    except (AttributeError, KeyError, TypeError, ValueError):
+    except (AssertionError, AttributeError, KeyError, TypeError, ValueError):
         prefix, version = "", 0
     if prefix != FORMAT:
         raise ValueError(f"{path} is not a hypotheses file; give one that `farside replay` wrote")

@@ -25,6 +25,7 @@ from perception.sources.frame import Frame
 from probnerf.pixel_status import FREE, OBJECT, UNKNOWN
 
 _SQUARE = np.ones((3, 3), bool)
+_MOST_OBJECTS = 255  # each has maps of the picture's size
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +119,11 @@ def _segment_depth(frame: Frame, object_id: int | None, config: SegmentConfig) -
         found = {1: (thing.mask, thing.plane)}
     elif label is not None:
         ids = [int(i) for i in np.unique(label) if i > 0]
-        if not ids:
-            raise ValueError("the label map names no object; give one with ids from 1, or none")
+        if not 0 < len(ids) <= _MOST_OBJECTS:
+            raise ValueError(
+                f"the label map names {len(ids) or 'no'} objects; give one with 1 to {_MOST_OBJECTS} ids above 0, or"
+                " none"
+            )
         plane = support_of(points, label, supports, config.plane)
         found = {i: (label == i, plane) for i in ids}
     else:

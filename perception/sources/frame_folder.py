@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.camera import Camera
+from foundation.bounded import check_size, parse_json
 from foundation.whole_file import write_whole
 from perception.sources.frame import SATURATED, Frame, known_counts
 from perception.sources.image_files import read_npy, read_picture, read_png
@@ -17,6 +18,7 @@ from perception.sources.registration import registered
 from probnerf.geometry import rigid
 
 DEPTH_UNIT_M = 1e-4  # of the depth.png that is written; 1 mm where that does not reach far enough
+LAST_STAMP = 2**31 * 10**9  # ns; ROS counts its seconds in 32 bits
 # Keys of meta.json, and their shapes, for the camera's K_std, distortion_std and rms.
 _DEVIATIONS: dict[str, tuple[int, ...]] = {"camera_matrix_std_px": (3, 3), "distortion_std": (-1,), "rms_px": ()}
 COLOURS = ("color.png", "color.jpg", "color.jpeg", "rgb.png", "rgb.jpg", "rgb.jpeg")  # the first one that exists
@@ -130,10 +132,11 @@ def write_frame_folder(path: Path | str, frame: Frame) -> None:
 def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
     """meta.json, its keys checked, and what it may omit filled in; depth_unit_m where there is `depth`."""
     try:
-        meta = json.loads(path.read_text(encoding="utf-8"))
+        meta = parse_json(path.read_text(encoding="utf-8"))
+        check_size(meta)
     except (FileNotFoundError, NotADirectoryError):
         raise FileNotFoundError(f"{path} is missing; it gives camera_matrix_px and depth_unit_m") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ValueError(f"{path} is not JSON ({error}); write it again") from None
     for key in ("camera_matrix_px", "depth_unit_m"):
         if not isinstance(meta, dict) or (key not in meta and (depth or key != "depth_unit_m")):
@@ -151,6 +154,8 @@ def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
     for key, default in optional.items():
         if isinstance(meta[key], bool) or not isinstance(meta[key], type(default)):
             raise ValueError(f"{path}: {key} is {meta[key]!r}; give something like {default!r}, or omit it")
+    if not 0 <= meta["stamp_ns"] < LAST_STAMP:
+        raise ValueError(f"{path}: stamp_ns is {meta['stamp_ns']}; give nanoseconds from 0 to {LAST_STAMP}, or omit it")
     meta["camera_matrix_px"] = _numbers(path, "camera_matrix_px", meta["camera_matrix_px"], (3, 3))
     meta["distortion"] = _numbers(path, "distortion", meta["distortion"], (len(meta["distortion"]),))
     for key, shape in _DEVIATIONS.items():
@@ -173,7 +178,7 @@ def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
 def _numbers(path: Path, key: str, value: object, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.array(np.nan)
     if array.shape != shape or not np.isfinite(array).all():
         wanted = f"{' rows of '.join(map(str, shape))} finite numbers" if shape else "a finite number"

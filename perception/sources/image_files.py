@@ -96,7 +96,46 @@ def _bytes(path: Path) -> bytes:
 
 
 def _decoded(path: Path, data: bytes, kind: str) -> Shaped[np.ndarray, "h w *c"]:
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    try:
+        return decoded(data)
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be decoded ({error}); save it again as {kind}") from None
+
+
+def decoded(data: bytes) -> Shaped[np.ndarray, "h w *c"]:
+    """The samples of a picture in any of OpenCV's formats, colours as BGR(A). Raises `ValueError` if there is none.
+
+    Of a PNG, size and data are looked at first: OpenCV takes missing pixels for black.
+    """
+    if data.startswith(_PNG_MAGIC):
+        _check_png(data)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    except cv2.error as error:
+        raise ValueError(f"OpenCV: {error.err}") from None
     if image is None:
-        raise ValueError(f"{path} cannot be decoded; save it again as {kind}")
+        raise ValueError("it is no picture, or damaged")
     return image
+
+
+def _check_png(data: bytes) -> None:
+    """Raises `ValueError` for a PNG that is too large, or has not as many pixels as it says."""
+    width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
+    bits, colours, interlaced = data[24:25], data[25:26], data[28:29]
+    if width * height * 4 > LARGEST:
+        raise ValueError(f"it is {width}x{height} px; give at most {LARGEST // 4} pixels")
+    channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colours[0]) if colours else None
+    if not channels or interlaced != b"\0":  # an interlaced one's rows are counted otherwise
+        return
+    wanted = height * (1 + (width * channels * bits[0] + 7) // 8)
+    at, inflate, have = len(_PNG_MAGIC), zlib.decompressobj(), 0
+    while at + 12 <= len(data):
+        size, kind = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
+        if kind == b"IDAT":
+            try:
+                have += len(inflate.decompress(data[at + 8 : at + 8 + size], wanted + 1))
+            except zlib.error:
+                break
+        at += 12 + size
+    if have < wanted:
+        raise ValueError(f"its pixels end after {have} of {wanted} bytes")

@@ -4,12 +4,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from perception.sources.frame import Frame, Source
-from perception.sources.image_files import colour_to_rgb, read_png
+from perception.sources.image_files import colour_to_rgb, decoded, read_png
 from perception.sources.open_source import VIDEO_SUFFIXES, open_source
 from perception.sources.reader import Reader
 from perception.sources.recording import first_messages, open_log
@@ -78,11 +77,10 @@ def _read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     if path.suffix.lower() == ".png":
         image = read_png(path)
     else:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-        decoded = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-        if decoded is None:
-            raise ValueError(f"{path} cannot be decoded; copy it again, or remove it")
-        image = decoded
+        try:
+            image = decoded(path.read_bytes())
+        except ValueError as error:
+            raise ValueError(f"{path} cannot be decoded ({error}); copy it again, or remove it") from None
     if image.dtype == np.uint16:  # depth, or a camera's raw grey
         image = (image >> 8).astype(np.uint8)
     if image.dtype != np.uint8:

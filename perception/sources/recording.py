@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -243,7 +244,10 @@ def open_log(path: Path) -> tuple[_Read, dict[str, str], list[str]]:
                 wanted = [c for c in reader.connections if c.topic in topics]
                 for connection, time, raw in reader.messages(wanted) if wanted else ():
                     kind = connection.msgtype
-                    yield _Received(connection.topic, kind, time, reader.deserialize(raw, kind))
+                    message: Any = reader.deserialize(raw, kind)
+                    if lacks := _fields(kind) - {name.lower() for name in message.__dataclass_fields__}:
+                        raise ValueError(f"its definition of {kind} lacks {', '.join(sorted(lacks))}")
+                    yield _Received(connection.topic, kind, time, message)
         except Exception as error:  # whichever parser meets the damage first; the caller's own errors do not pass here
             raise ValueError(f"{path} is damaged ({one_line(error)}); record it again") from None
 
@@ -258,6 +262,12 @@ def open_log(path: Path) -> tuple[_Read, dict[str, str], list[str]]:
             "repair it with `rosbag reindex`" if path.suffix == ".bag" else "give a .mcap, .bag or ROS 2 bag folder"
         )
         raise ValueError(f"{path} cannot be read as a recording ({one_line(error)}); {remedy}") from None
+
+
+@cache
+def _fields(kind: str) -> frozenset[str]:
+    """The fields of a standard type, in small letters (ROS 1 wrote K, D, P); none of another type."""
+    return frozenset(name.lower() for name, _ in _TYPES.fielddefs[kind][1]) if kind in _TYPES.fielddefs else frozenset()
 
 
 def _open_cut(paths: list[Path]) -> tuple[_Read, dict[str, str], list[str]]:

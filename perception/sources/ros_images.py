@@ -2,14 +2,13 @@
 
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int32, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
 from perception.sources.frame import known_counts
-from perception.sources.image_files import colour_to_rgb
+from perception.sources.image_files import colour_to_rgb, decoded
 
 POSE_TOPIC = "/camera/color/pose"  # where a Farside recording keeps T_world_camera (geometry_msgs/PoseStamped)
 MM = np.float32(1e-3)
@@ -82,10 +81,12 @@ def samples(message: Any) -> Shaped[np.ndarray, "h w *c"]:
     if not hasattr(message, "encoding"):
         if "compressedDepth" in message.format:
             data = data[12:]  # the transport's header, which only 32FC1 needs
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-        if image is None or encoding == "32FC1":
-            raise ValueError(f"cannot decode {message.format!r}; record it as PNG, JPEG or raw")
-        return image
+        try:
+            if encoding == "32FC1":
+                raise ValueError("floats are not read")
+            return decoded(data.tobytes())
+        except ValueError as error:
+            raise ValueError(f"cannot decode {message.format!r} ({error}); record it as PNG, JPEG or raw") from None
     if encoding not in _ENCODINGS:
         raise ValueError(f"encoding {encoding!r} is not read; record one of {', '.join(_ENCODINGS)}")
     sample, channels = _ENCODINGS[encoding]

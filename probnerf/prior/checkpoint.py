@@ -12,6 +12,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from foundation.bounded import parse_json
 from foundation.whole_file import write_whole
 from probnerf.prior.networks import PRESETS, ProbNeRF, Recognition
 from probnerf.prior.posterior_flow import NetworkSizes, PosteriorNetwork
@@ -178,9 +179,11 @@ def _read(path: Path, what: str, remedy: str) -> tuple[dict[str, Any], dict[str,
     """A file's metadata and arrays."""
     try:
         with safe_open(path, framework="np") as file:
-            story = json.loads((file.metadata() or {}).get("farside", "{}"))
+            story = parse_json((file.metadata() or {}).get("farside", "{}"))
+            if not isinstance(story, dict):
+                raise ValueError("its metadata is no mapping")
             return story, {name: file.get_tensor(name) for name in file.keys()}
-    except (SafetensorError, json.JSONDecodeError, OSError) as error:
+    except (SafetensorError, ValueError, OSError) as error:
         raise ValueError(f"{path} is not a readable {what} ({error}); {remedy}") from None
 
 

@@ -95,6 +95,9 @@ def test_empty_arrays_pass() -> None:
         ({"model": "equidistant"}, "does not fit equidistant: 4"),
         ({"distortion": np.zeros(3)}, "4 or 5"),
         ({"distortion": np.full(5, np.inf)}, "finite"),
+        ({"K_std": -np.eye(3)}, "K_std is .*0 or more"),
+        ({"distortion_std": np.full(5, np.nan)}, "distortion_std is"),
+        ({"rms": -0.1}, "rms is -0.1"),
     ],
 )
 def test_what_is_no_camera_is_refused(change: dict, says: str) -> None:

@@ -64,6 +64,9 @@ def test_a_file_of_ros_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(camera.distortion, [-0.39, 0.29, 0.0001, -0.0004, 0])
 
 
+LAUGHS = "a: &a [1]\n" + "".join(f"{y}: &{y} [{', '.join([f'*{x}'] * 99)}]\n" for x, y in ("ab", "bc", "cd"))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
@@ -75,6 +78,9 @@ def test_a_file_of_ros_is_read(tmp_path: Path) -> None:
         ("  cols: 5", "  columns: 5", "distortion_coefficients is"),
         (ROS, "- 1", "no keys"),
         (ROS, "a: [", "not YAML"),
+        ("data: [430, 0,", f"data: [{10**400}, 0,", "too large"),
+        (ROS, "[" * 5000, "not YAML"),
+        (ROS, LAUGHS, "aliases"),
     ],
 )
 def test_a_broken_file_says_so_in_one_line(tmp_path: Path, old: str, new: str, says: str) -> None:

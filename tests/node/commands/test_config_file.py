@@ -95,6 +95,13 @@ def test_a_files_trouble_names_the_file(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"a\.yaml is not YAML \(line 4: .*key \"width\".*; omit one") as caught:
         load_config(path, Outer)
     assert "\n" not in str(caught.value)
+    lines = [f"{y}: &{y} [{', '.join([f'*{x}'] * 99)}]\n" for x, y in ("ab", "bc", "cd")]
+    path.write_text("name: &a [1]\n" + "".join(lines))
+    with pytest.raises(ValueError, match=r"a\.yaml is not YAML \(it holds more than"):
+        load_config(path, Outer)
+    path.write_text("[" * 5000)
+    with pytest.raises(ValueError, match=r"a\.yaml is not YAML"):
+        load_config(path, Outer)
     path.write_text("name: on\ninner: {width: 5e-3}\n")  # as YAML 1.2 reads them
     assert load_config(path, Outer) == Outer("on", inner=Inner(0.005))
     path.write_text("")

@@ -173,7 +173,8 @@ def test_what_cannot_be_segmented_is_named() -> None:
         (blank(frame, frame.label == 1), 1, "0 of them with depth"),
         (replace(frame, depth=noise), None, "no support plane"),
         (replace(picture(), label=None), None, "nothing stands"),
-        (picture(), 1, "the label map names no object"),
+        (picture(), 1, "the label map names no objects"),
+        (replace(frame, label=np.arange(frame.depth.size).reshape(frame.depth.shape)), None, "names 76799 objects"),
     ]
     for broken, wanted, says in cases:
         with pytest.raises(ValueError, match=says) as caught:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 from calibration.camera import Camera
 from perception.sources.frame import Frame
 from perception.sources.frame_folder import read_frame_folder, write_frame_folder
+from perception.sources.image_files import read_png
 from perception.sources.open_source import open_source
 
 REAL = Path(__file__).parents[3] / "../shared/data/ycbv_000002"
@@ -90,6 +92,36 @@ def test_a_damaged_png_is_named(folder: Path) -> None:
     fails(folder, "color.png", "not a PNG")
 
 
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"width": 30_000, "height": 30_000}, "30000x30000"),
+        ({"height": 480}, "pixels end after"),
+    ],
+)
+def test_a_png_that_says_more_than_it_holds_is_named(
+    folder: Path, capfd: pytest.CaptureFixture, change: dict, says: str
+) -> None:
+    data = bytearray((folder / "color.png").read_bytes())
+    for name, size in change.items():
+        at = {"width": 16, "height": 20}[name]
+        data[at : at + 4] = size.to_bytes(4, "big")
+    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
+    (folder / "color.png").write_bytes(data)
+    fails(folder, "color.png", says)
+    assert capfd.readouterr().err == ""  # OpenCV's readers print
+
+
+def test_every_kind_of_png_is_read(folder: Path) -> None:
+    rng = np.random.default_rng(1)
+    for channels, dtype in ((1, np.uint8), (3, np.uint8), (4, np.uint8), (1, np.uint16), (3, np.uint16)):
+        image = rng.integers(0, np.iinfo(dtype).max, (7, 5, channels)).astype(dtype)
+        cv2.imwrite(str(folder / "any.png"), image)
+        np.testing.assert_array_equal(read_png(folder / "any.png").reshape(image.shape), image)
+    cv2.imwrite(str(folder / "any.png"), image[..., 0] > 9, [cv2.IMWRITE_PNG_BILEVEL, 1])
+    assert read_png(folder / "any.png").shape[:2] == (7, 5)
+
+
 def test_sizes_that_differ_are_named(folder: Path) -> None:
     cv2.imwrite(str(folder / "depth.png"), np.ones((24, 32), np.uint16))
     fails(folder, "depth.png", "32x24", "64x48", "align")
@@ -115,6 +147,8 @@ def test_eight_bit_depth_is_refused(folder: Path) -> None:
         ({"camera_matrix_px": K, "depth_unit_m": 0.001, "distortion": ["k", 0, 0, 0]}, "not 4 finite numbers"),
         ({"camera_matrix_px": K, "depth_unit_m": 0.001, "distortion_model": "barrel"}, "'barrel' is unknown"),
         ({"camera_matrix_px": K, "depth_unit_m": 0.001, "stamp_ns": "now"}, "stamp_ns is 'now'"),
+        ({"camera_matrix_px": K, "depth_unit_m": 0.001, "stamp_ns": -1}, "stamp_ns is -1"),
+        ({"camera_matrix_px": [[10**400, 0, 0], *K[1:]], "depth_unit_m": 0.001}, "finite"),
         ({"camera_matrix_px": K, "depth_unit_m": 0.001, "frame_id": None}, "frame_id is None"),
         ({"camera_matrix_px": K, "depth_unit_m": 0.001, "T_world_camera": K}, "4 rows of 4 finite numbers"),
         ({"camera_matrix_px": K, "depth_unit_m": 0.001, "camera_matrix_std_px": 2.0}, "3 rows of 3 finite numbers"),

@@ -328,3 +328,14 @@ def test_the_real_bag_reads() -> None:
     assert frame.rgb.shape == (960, 1280, 3) and frame.depth is None
     assert frame.camera.distortion.any()
     assert "no depth" in log.notes[0]
+
+
+@pytest.mark.parametrize(("field", "kind"), [("width", "CameraInfo"), ("is_bigendian", "Image")])
+def test_a_damaged_definition_is_named(tmp_path: Path, field: str, kind: str) -> None:
+    path = tmp_path / "a.mcap"
+    write_log(path, frames())
+    data = path.read_bytes()
+    assert field.encode() in data
+    spoilt = data.replace(f" {field}\n".encode(), f" {field[:-1]}_\n".encode())
+    path.write_bytes(spoilt)
+    says(path, "damaged", f"definition of sensor_msgs/msg/{kind} lacks {field}")

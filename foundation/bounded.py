@@ -1,0 +1,54 @@
+"""What comes from outside, checked against limits before it is built, quoted or allocated."""
+
+import json
+import math
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+MOST_VALUES = 100_000  # of a parsed text; aliases of YAML count as often as they are used
+LARGEST_ARRAY = 1 << 30  # bytes
+
+
+def parse_json(text: str | bytes) -> Any:
+    """The content of a JSON text. Raises ValueError for what is no JSON, or is nested too deep."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
+
+
+def check_size(content: object) -> None:
+    """Raises ValueError where nested mappings and lists hold more than `MOST_VALUES`."""
+    count, waiting = 0, [content]
+    while waiting:
+        value = waiting.pop()
+        count += 1
+        if count + len(waiting) > MOST_VALUES:
+            raise ValueError(f"it holds more than {MOST_VALUES} values, repeated aliases counted")
+        if isinstance(value, Mapping):
+            waiting.extend(value.values())
+        elif isinstance(value, list | tuple):
+            waiting.extend(value)
+
+
+def check_arrays(path: Path) -> None:
+    """Raises ValueError where an array of an .npz file is larger than `LARGEST_ARRAY`, or not as large as it says.
+
+    Raises zipfile.BadZipFile for another file.
+    """
+    with zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            if not info.filename.endswith(".npy"):
+                continue
+            with archive.open(info) as member:
+                old = np.lib.format.read_magic(member) == (1, 0)
+                header = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
+                shape, _, dtype = header(member)
+                held = info.file_size - member.tell()
+            size = math.prod(shape) * dtype.itemsize
+            if not dtype.hasobject and (size != held or size > LARGEST_ARRAY):
+                raise ValueError(f"{info.filename} says it has {size} bytes, and has {held}; at most {LARGEST_ARRAY}")
