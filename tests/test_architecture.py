@@ -32,7 +32,7 @@ PACKAGES = ("foundation", "calibration", "probnerf", "perception", "node", "fars
 # Inside a folder: its rooms and files from the lowest layer to the highest. Each may import its own layer and those
 # before it; circles are excluded by a test of their own.
 LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
-    "foundation": (("one_line", "whole_file"),),
+    "foundation": (("bounded", "one_line", "whole_file"),),
     "calibration": (
         ("boards", "camera", "turntable"),
         ("calibrate", "camera_file", "print_board", "turntable_pose"),

@@ -1,4 +1,4 @@
-"""What no reader expected still ends in one line that names the input, and files that lie about their size are refused."""
+"""What no reader expected still ends in one line that names the input; files that lie about their size are refused."""
 
 import io
 import zipfile
