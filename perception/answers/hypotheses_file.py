@@ -24,6 +24,12 @@ from probnerf.types import StopReason
 
 FORMAT = "farside-hypotheses-"
 VERSION = 2  # 1: poses without z
+# The header's fields by type, as `save` writes them.
+_WHOLE = ("stamp_ns", "object_id", "stage", "seed")
+_NUMBERS = ("half_extent", "xy_sigma", "log_scale_sigma", "along_sigma", "sight_sigma", "monte_carlo_error")
+_TEXTS = ("frame_id", "label", "prior_hash", "result")
+_FLAGS = ("inside_view", "out_of_model")
+_MAPPINGS = ("diagnostics", "kinds")
 
 
 def hypotheses_path(folder: str | Path, object_id: int) -> Path:
@@ -152,8 +158,24 @@ def _header(path: Path, arrays: dict[str, np.ndarray]) -> dict:
     return header
 
 
+def _check_types(header: dict) -> None:
+    for names, kinds in (
+        (_WHOLE, int),
+        (_NUMBERS, (int, float)),
+        (_TEXTS, str),
+        (_FLAGS, bool),
+        (_MAPPINGS, dict),
+    ):
+        for name in names:
+            value = header.get(name)
+            fits = isinstance(value, kinds) and (kinds is bool or not isinstance(value, bool))
+            if name in header and (not fits or (isinstance(value, int) and abs(value) >= 2**63)):
+                raise ValueError(f"{name} is {str(value)[:40]}")
+
+
 def _from_file(header: dict, arrays: dict[str, np.ndarray]) -> Hypotheses:
-    """The inverse of `save`; raises KeyError for a missing field."""
+    """The inverse of `save`; raises KeyError for a missing field, ValueError for one of another type."""
+    _check_types(header)
     frame = ObjectFrame(
         T_camera_object=arrays["T_camera_object"],
         half_extent=header["half_extent"],
