@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from foundation.one_line import one_line
+
 MOST_VALUES = 100_000  # of a parsed text; aliases of YAML count as often as they are used
 LARGEST_ARRAY = 1 << 30  # bytes
 
@@ -45,9 +47,12 @@ def check_arrays(path: Path) -> None:
             if not info.filename.endswith(".npy"):
                 continue
             with archive.open(info) as member:
-                old = np.lib.format.read_magic(member) == (1, 0)
-                header = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
-                shape, _, dtype = header(member)
+                try:
+                    old = np.lib.format.read_magic(member) == (1, 0)
+                    header = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
+                    shape, _, dtype = header(member)
+                except Exception as error:  # NumPy parses the header as Python, which has many ways to fail
+                    raise ValueError(f"{info.filename} has no readable header: {one_line(error)[:100]}") from None
                 held = info.file_size - member.tell()
             size = math.prod(shape) * dtype.itemsize
             if not dtype.hasobject and (size != held or size > LARGEST_ARRAY):

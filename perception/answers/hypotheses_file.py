@@ -30,6 +30,14 @@ _NUMBERS = ("half_extent", "xy_sigma", "log_scale_sigma", "along_sigma", "sight_
 _TEXTS = ("frame_id", "label", "prior_hash", "result")
 _FLAGS = ("inside_view", "out_of_model")
 _MAPPINGS = ("diagnostics", "kinds")
+_SAMPLES = {
+    "pose": "f",
+    "weights": "f",
+    "population": "iu",
+    "T_camera_object": "f",
+    "plane": "f",
+    "T_world_camera": "f",
+}
 
 
 def hypotheses_path(folder: str | Path, object_id: int) -> Path:
@@ -158,7 +166,10 @@ def _header(path: Path, arrays: dict[str, np.ndarray]) -> dict:
     return header
 
 
-def _check_types(header: dict) -> None:
+def _check_types(header: dict, arrays: dict[str, np.ndarray]) -> None:
+    for name, samples in _SAMPLES.items():
+        if name in arrays and arrays[name].dtype.kind not in samples:
+            raise ValueError(f"{name} holds {arrays[name].dtype}")
     for names, kinds in (
         (_WHOLE, int),
         (_NUMBERS, (int, float)),
@@ -175,7 +186,7 @@ def _check_types(header: dict) -> None:
 
 def _from_file(header: dict, arrays: dict[str, np.ndarray]) -> Hypotheses:
     """The inverse of `save`; raises KeyError for a missing field, ValueError for one of another type."""
-    _check_types(header)
+    _check_types(header, arrays)
     frame = ObjectFrame(
         T_camera_object=arrays["T_camera_object"],
         half_extent=header["half_extent"],
