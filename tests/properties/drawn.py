@@ -147,7 +147,11 @@ def _optics(draw: st.DrawFn) -> dict[str, Any]:
     lengths = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
     model = draw(st.sampled_from(sorted(lengths)))
     size = draw(st.sampled_from(lengths[model]))
-    return {"model": model, "distortion": draw(vectors(size)), "distortion_std": draw(st.none() | vectors(size))}
+    return {
+        "model": model,
+        "distortion": draw(vectors(size)),
+        "distortion_std": draw(st.none() | vectors(size).map(abs)),
+    }
 
 
 @st.composite
@@ -160,8 +164,9 @@ def _matrices(draw: st.DrawFn) -> np.ndarray:
 def cameras(**own: Any) -> st.SearchStrategy[Camera]:
     """Any camera."""
     usual = {"width": st.integers(1, 9999), "height": st.integers(1, 9999), "K": _matrices()}
-    deviations = st.none() | vectors(9).map(lambda v: v.reshape(3, 3))
-    return every_field(Camera, _optics(), **(usual | {"K_std": deviations} | own))
+    usual["K_std"] = st.none() | vectors(9).map(lambda v: np.abs(v).reshape(3, 3))
+    usual["rms"] = st.none() | st.floats(0.0, 10.0)
+    return every_field(Camera, _optics(), **(usual | own))
 
 
 @st.composite
