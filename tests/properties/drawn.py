@@ -171,10 +171,10 @@ def cameras(**own: Any) -> st.SearchStrategy[Camera]:
 
 @st.composite
 def _images(draw: st.DrawFn) -> dict[str, Any]:
-    """Colour, and maybe depth (1 mm to 60 m, or unknown) and labels, and the camera of that size."""
+    """Colour, and maybe depth (1 mm to 49 m, or unknown) and labels, and the camera of that size."""
     width, height = draw(st.integers(1, 9)), draw(st.integers(1, 9))
     rng = np.random.default_rng(draw(seeds))
-    depth = np.where(rng.random((height, width)) < 0.2, np.nan, rng.uniform(1e-3, 60.0, (height, width)))
+    depth = np.where(rng.random((height, width)) < 0.2, np.nan, rng.uniform(1e-3, 49.0, (height, width)))
     label = rng.integers(0, draw(st.sampled_from([2, 256, 65536])), (height, width), dtype=np.int32)
     return {
         "rgb": rng.integers(0, 256, (height, width, 3), dtype=np.uint8),
