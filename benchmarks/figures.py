@@ -120,22 +120,19 @@ def _measured(name: str, lines: list[Line], drawn: Callable[[str, Summary], None
     found: list[str] = []
     for prior in priors:
         if len(priors) > 1:
-            found.append(f"#### {_named(prior)}\n")
+            found.append(f"#### {_prior_names().get(prior, f'Another prior, {prior[:8]}')}\n")
         found += _of_prior(name, newest(lines, prior), drawn if prior == priors[0] else None)
     return found
 
 
-def _named(prior: str) -> str:
-    """A heading for the rows of a prior, by its identity."""
-    return _names().get(prior, f"Another prior, {prior[:8]}")
-
-
 @cache
-def _names() -> dict[str, str]:
+def _prior_names() -> dict[str, str]:
+    """The names of priors in the checkout, by their identities."""
     return {load_prior(path).identity: words for path, words in PRIORS.items()}
 
 
 def _of_prior(name: str, same: list[Line], drawn: Callable[[str, Summary], None] | None) -> list[str]:
+    """The tables of rows of one prior (`same`), and where these are from."""
     study = importlib.import_module(f"benchmarks.studies.{name}")
     found: list[str] = []
     for options in (study.Options(), *getattr(study, "ALSO", ())):

@@ -5,16 +5,15 @@ eleven objects, each with its true mask and with the mask that `segment` finds w
 the sampler. Poses of PoseCNN's objects were fitted to the depth; `fit_mm` says how well. Perception answers over the
 whole path from frame to hypotheses with a limit of stages, so that the load of the machine does not enter. Beside it,
 on the same masks, a Bayesian Hilbert map as V-PRISM makes it; V-PRISM itself (arXiv 2403.08106) scored on the first
-frame, with true masks: can 0.80, pitcher 1.23, sugar box 0.44, meat can 0.15. To answer one half everywhere scores
-0.693.
+frame, with true masks: can 0.80, pitcher 1.23, sugar box 0.44, meat can 0.15 (whether it left out what is below the
+measured table is not known). To answer one half everywhere scores 0.693.
 
 - balanced: half the mean -log p_occupied over points of the hidden surface (at least 10 mm behind the measured depth)
   plus half the mean -log(1 - p_occupied) over unseen free points (`real_objects.free_points`), p clipped to 0.001 ...
   0.999. All above the measured plane, as in the other studies. A score is the mean of an object's seeds; `spread` is
   the largest seed less the smallest.
 - in_table: share of the hidden surface that lies below the measured plane, and balanced_with_table the score with it.
-  True bottoms are up to 10 mm in the table there, whose measured plane is within 1 mm of the table beside them: pose
-  and depth contradict each other.
+  Nothing can be in a table, so that pose and depth contradict each other there.
 - ece: calibration error over these points, pooled over objects.
 - near: mean p_occupied of hidden points 5 to 15 mm outside of the surface. To dilate a shape raises it.
 - in_sight: share of the surface in sight with p_occupied >= 0.9 within one voxel.

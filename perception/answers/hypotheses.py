@@ -67,8 +67,8 @@ class Hypotheses:
         plane, half_extent = self.object_frame.plane, self.object_frame.half_extent
         if np.shape(plane) != (4,) or not np.isfinite(plane).all():
             raise ValueError(f"plane is {np.asarray(plane).tolist()}; it must be four finite numbers")
-        if not 0 < half_extent < np.inf:
-            raise ValueError(f"half_extent is {half_extent}; it must be more than 0 m")
+        if not 1e-4 <= half_extent <= 1e3:
+            raise ValueError(f"half_extent is {half_extent}; it must be 0.0001 to 1000 m")
         if self.kinds and not (min(self.kinds.values()) >= 0 and abs(sum(self.kinds.values()) - 1.0) < 1e-3):
             raise ValueError(f"kinds are {dict(self.kinds)}; they must not be negative and must sum to 1")
         if not np.isfinite(self.pose).all():

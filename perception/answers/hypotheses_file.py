@@ -24,19 +24,18 @@ from probnerf.types import StopReason
 
 FORMAT = "farside-hypotheses-"
 VERSION = 2  # 1: poses without z
-# The header's fields by type, as `save` writes them.
-_WHOLE = ("stamp_ns", "object_id", "stage", "seed")
-_NUMBERS = ("half_extent", "xy_sigma", "log_scale_sigma", "along_sigma", "sight_sigma", "monte_carlo_error")
-_TEXTS = ("frame_id", "label", "prior_hash", "result")
-_FLAGS = ("inside_view", "out_of_model")
-_MAPPINGS = ("diagnostics", "kinds")
+# What `save` writes: the header's fields by their JSON types, and the arrays by the kinds of their samples.
+_HEADER: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("stamp_ns", "object_id", "stage", "seed"), (int,)),
+    **dict.fromkeys(("half_extent", "xy_sigma", "log_scale_sigma", "along_sigma"), (int, float)),
+    **dict.fromkeys(("sight_sigma", "monte_carlo_error"), (int, float)),
+    **dict.fromkeys(("frame_id", "label", "prior_hash", "result"), (str,)),
+    **dict.fromkeys(("inside_view", "out_of_model"), (bool,)),
+    **dict.fromkeys(("diagnostics", "kinds"), (dict,)),
+}
 _SAMPLES = {
-    "pose": "f",
-    "weights": "f",
+    **dict.fromkeys(("pose", "weights", "T_camera_object", "plane", "T_world_camera"), "f"),
     "population": "iu",
-    "T_camera_object": "f",
-    "plane": "f",
-    "T_world_camera": "f",
 }
 
 
@@ -154,10 +153,9 @@ def _header(path: Path, arrays: dict[str, np.ndarray]) -> dict:
     """The JSON header, its format checked."""
     try:
         header = parse_json(arrays["header"].tobytes())
-        assert isinstance(header, dict)
-        name = header["format"]
+        name = header["format"]  # a TypeError where the header is no mapping
         prefix, version = name[: len(FORMAT)], int(name[len(FORMAT) :])
-    except (AssertionError, AttributeError, KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, TypeError, ValueError):
         prefix, version = "", 0
     if prefix != FORMAT:
         raise ValueError(f"{path} is not a hypotheses file; give one that `farside replay` wrote")
@@ -167,21 +165,17 @@ def _header(path: Path, arrays: dict[str, np.ndarray]) -> dict:
 
 
 def _check_types(header: dict, arrays: dict[str, np.ndarray]) -> None:
+    """Raises ValueError for a field or an array that `save` would not have written so. Absent ones are left alone."""
     for name, samples in _SAMPLES.items():
         if name in arrays and arrays[name].dtype.kind not in samples:
             raise ValueError(f"{name} holds {arrays[name].dtype}")
-    for names, kinds in (
-        (_WHOLE, int),
-        (_NUMBERS, (int, float)),
-        (_TEXTS, str),
-        (_FLAGS, bool),
-        (_MAPPINGS, dict),
-    ):
-        for name in names:
-            value = header.get(name)
-            fits = isinstance(value, kinds) and (kinds is bool or not isinstance(value, bool))
-            if name in header and (not fits or (isinstance(value, int) and abs(value) >= 2**63)):
-                raise ValueError(f"{name} is {str(value)[:40]}")
+    for name, kinds in _HEADER.items():
+        if name not in header:
+            continue
+        value = header[name]
+        # JSON's true is an int to Python, and its numbers have any length
+        if type(value) not in kinds or (isinstance(value, int) and abs(value) >= 2**63):
+            raise ValueError(f"{name} is {str(value)[:40]}")
 
 
 def _from_file(header: dict, arrays: dict[str, np.ndarray]) -> Hypotheses:

@@ -109,14 +109,22 @@ def _object_in(
     )
     part = np.ascontiguousarray(rgb[window][..., ::-1])
     marks = np.where(region[window], cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
-    cv2.setRNGSeed(0)  # its clusters start at random
-    models = np.zeros((2, 1, 65))
-    cv2.grabCut(part, marks, (0, 0, 1, 1), models[0], models[1], config.iterations, cv2.GC_INIT_WITH_MASK)
-    regions, count = ndimage.label(ndimage.binary_opening(marks == cv2.GC_PR_FGD, _SQUARE))
+    regions, count = ndimage.label(ndimage.binary_opening(grab_cut(part, marks, config.iterations), _SQUARE))
     mask = np.zeros(region.shape, bool)
     if count:
         mask[window] = _whole(regions == np.bincount(regions.ravel())[1:].argmax() + 1)
     return mask
+
+
+def grab_cut(
+    bgr: UInt8[np.ndarray, "h w 3"], marks: UInt8[np.ndarray, "h w"], iterations: int
+) -> Bool[np.ndarray, "h w"]:
+    """The foreground (GrabCut, Rother et al. 2004) that begins at marks of OpenCV's kinds; the same in every run."""
+    cv2.setRNGSeed(0)  # its clusters start at random
+    models = np.zeros((2, 1, 65))
+    marks = marks.copy()
+    cv2.grabCut(bgr, marks, (0, 0, 1, 1), models[0], models[1], iterations, cv2.GC_INIT_WITH_MASK)
+    return np.isin(marks, (cv2.GC_FGD, cv2.GC_PR_FGD))
 
 
 def _whole(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

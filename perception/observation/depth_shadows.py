@@ -7,6 +7,8 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from scipy import ndimage
 
+from perception.observation.colour_masks import grab_cut
+
 _SQUARE = np.ones((3, 3), bool)
 _AROUND = 0.35  # of a mask's longer side: how far around it colours are looked at
 _EDGE = 3  # px on either side of a mask that may be of either: depth's edges lie beside colour's
@@ -22,7 +24,7 @@ def by_colour(
 ) -> list[Bool[np.ndarray, "h w"]]:
     """Which pixels without depth, in each of the masks or joined to it, are of its thing by their colour.
 
-    GrabCut (Rother et al. 2004) with what depth says as its certain pixels. The first mask that asks for a pixel gets
+    GrabCut (`grab_cut`) with what depth says as its certain pixels. The first mask that asks for a pixel gets
     it.
     """
     taken = np.any([np.zeros_like(measured), *masks], axis=0)
@@ -46,18 +48,18 @@ def _alike(
     pad = max(8, round(_AROUND * max(np.ptp(rows), np.ptp(columns))))
     part = tuple(slice(max(i[0] - pad, 0), i[-1] + 1 + pad) for i in (rows, columns))
     own, other, seen = mask[part], others[part], measured[part]
-    open_ = _joined(~seen & ~other, own)
+    candidates = _joined(~seen & ~other, own)
     core = ndimage.binary_erosion(own & seen, _SQUARE, iterations=_EDGE)
-    if not open_.any() or not core.any():
+    if not candidates.any() or not core.any():
         return alike
     marks = np.full(own.shape, cv2.GC_BGD, np.uint8)
-    marks[ndimage.binary_dilation(own, _SQUARE, iterations=_EDGE) & ~other | open_] = cv2.GC_PR_BGD
+    marks[ndimage.binary_dilation(own, _SQUARE, iterations=_EDGE) & ~other | candidates] = cv2.GC_PR_BGD
     marks[own] = cv2.GC_PR_FGD
     marks[core] = cv2.GC_FGD
     if (marks != cv2.GC_BGD).all():  # nothing to tell it from
         return alike
-    taken = _cut(np.ascontiguousarray(rgb[part][..., ::-1]), marks) & open_
-    taken = _joined(ndimage.binary_opening(taken | own, _SQUARE), own) & open_
+    taken = _cut(np.ascontiguousarray(rgb[part][..., ::-1]), marks) & candidates
+    taken = _joined(ndimage.binary_opening(taken | own, _SQUARE), own) & candidates
     edge = np.pad(np.zeros(np.subtract(own.shape, 2), bool), 1, constant_values=True)
     if taken.sum() <= _MOST * (own & seen).sum() and not (taken & edge).any():  # else a far background is of its colour
         alike[part] = taken
@@ -77,12 +79,9 @@ def _cut(bgr: UInt8[np.ndarray, "h w 3"], marks: UInt8[np.ndarray, "h w"]) -> Bo
     scale = min(1.0, _SIDE / max(height, width))
     size = (max(round(width * scale), 1), max(round(height * scale), 1))
     small = cv2.resize(bgr, size, interpolation=cv2.INTER_AREA)
-    result = cv2.resize(marks, size, interpolation=cv2.INTER_NEAREST)
-    cv2.setRNGSeed(0)  # its clusters start at random
-    models = np.zeros((2, 1, 65))
+    smaller_marks = cv2.resize(marks, size, interpolation=cv2.INTER_NEAREST)
     try:
-        cv2.grabCut(small, result, (0, 0, 1, 1), models[0], models[1], _ITERATIONS, cv2.GC_INIT_WITH_MASK)
+        foreground = grab_cut(small, smaller_marks, _ITERATIONS)
     except cv2.error:  # no certain pixel is left at this size
         return np.zeros(marks.shape, bool)
-    foreground = np.isin(result, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.uint8) * 255
-    return cv2.resize(foreground, (width, height), interpolation=cv2.INTER_LINEAR) > 127
+    return cv2.resize(foreground.astype(np.uint8) * 255, (width, height), interpolation=cv2.INTER_LINEAR) > 127

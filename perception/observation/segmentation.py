@@ -146,8 +146,8 @@ def _segment_depth(frame: Frame, object_id: int | None, config: SegmentConfig) -
         pixels, measured = int(mask.sum()), int((mask & seen).sum())
         if measured >= config.min_pixels:
             own = _own_plane(points, plane, mask, config)
-            statuses = _statuses(points, own, mask | alike[i], label, alike[i], config)
-            segments.append(Segment(i, mask | alike[i], own, *statuses))
+            whole = mask | alike[i]
+            segments.append(Segment(i, whole, own, *_statuses(points, own, whole, label, alike[i], config)))
             continue
         reason = f"{pixels} pixels, {measured} of them with depth; at least {config.min_pixels} are needed"
         if i == object_id or len(found) == 1:

@@ -9,8 +9,10 @@ import cv2
 import numpy as np
 from jaxtyping import Shaped, UInt8
 
+from foundation.bounded import check_arrays
+
 _PNG_MAGIC, _JPEG_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-LARGEST = 1 << 26  # values of an array; a picture of 16 million pixels in RGBA
+LARGEST = 1 << 26  # values of an array, or pixels of a PNG
 
 
 def read_png(path: Path) -> Shaped[np.ndarray, "h w *c"]:
@@ -67,10 +69,10 @@ def read_npz(path: Path, names: Sequence[str]) -> dict[str, Shaped[np.ndarray, "
     """Those arrays of a .npz file whose names are among `names`, whatever their case. Raises as `read_npy`."""
     wanted = {name.lower() for name in names}
     try:
-        with zipfile.ZipFile(path) as archive:
-            for info in archive.infolist():
-                if info.filename.removesuffix(".npy").lower() in wanted and info.file_size > 8 * LARGEST:
-                    raise ValueError(f"{path}: {info.filename} unpacks to {info.file_size >> 20} MB; give one frame")
+        try:
+            check_arrays(path, wanted, 8 * LARGEST)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}; give one frame") from None
         with np.load(path, allow_pickle=False) as arrays:
             chosen = [name for name in arrays.files if name.lower() in wanted]
             return {name.lower(): _plain(f"{path}: {name}", arrays[name]) for name in chosen}
@@ -122,8 +124,8 @@ def _check_png(data: bytes) -> None:
     """Raises `ValueError` for a PNG that is too large, or has not as many pixels as it says."""
     width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
     bits, colours, interlaced = data[24:25], data[25:26], data[28:29]
-    if width * height * 4 > LARGEST:
-        raise ValueError(f"it is {width}x{height} px; give at most {LARGEST // 4} pixels")
+    if width * height > LARGEST:
+        raise ValueError(f"it is {width}x{height} px; give at most {LARGEST} pixels")
     channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colours[0]) if colours else None
     if not channels or interlaced != b"\0":  # an interlaced one's rows are counted otherwise
         return

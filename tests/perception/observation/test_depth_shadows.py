@@ -15,7 +15,7 @@ from tests.perception.cylinders import CAN, Cylinder, picture
 OTHER = Cylinder(0.14, 0.05, 0.03, 0.08)
 
 
-def in_shadow(seed: int = 0, alike: bool = False) -> tuple[Frame, Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+def in_shadow(alike: bool = False) -> tuple[Frame, Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """A can, noisy in colour, without depth in the right quarter of it and as much beside it; its mask; the strip."""
     frame = picture(CAN, OTHER)
     can = frame.label == 1
@@ -24,7 +24,7 @@ def in_shadow(seed: int = 0, alike: bool = False) -> tuple[Frame, Bool[np.ndarra
     strip = np.zeros_like(can)
     strip[rows[0] - 5 : rows[-1] + 5, columns[-1] - quarter : columns[-1] + quarter] = True
     rgb = np.full_like(frame.rgb, 180) if alike else frame.rgb
-    rgb = np.clip(rgb + 8.0 * np.random.default_rng(seed).normal(size=rgb.shape), 0, 255).astype(np.uint8)
+    rgb = np.clip(rgb + 8.0 * np.random.default_rng(0).normal(size=rgb.shape), 0, 255).astype(np.uint8)
     depth = np.where(strip, np.float32(np.nan), frame.depth)
     return replace(frame, rgb=rgb, depth=depth, label=None), can, strip
 
