@@ -192,9 +192,11 @@ def called_free(p_free: Float[np.ndarray, "n"], occupied: Bool[np.ndarray, "n"])
 
 
 def summary(lines: list[Line], options: Options) -> Summary | None:
-    """Figures of the conditions that are asked for; None where there are no rows of them."""
+    """Figures of the conditions that are asked for, of each its first `n` objects; None where there are no rows."""
     conditions = selected(options.conditions, list(SORTS), "condition")
     lines = _answered_by_all([line for line in lines if line["condition"] in conditions])
+    first = {c: sorted({line["object"] for line in lines if line["condition"] == c})[: options.n] for c in conditions}
+    lines = [line for line in lines if line["object"] in first[line["condition"]]]
     if not lines:
         return None
     rows = _rows(lines)

@@ -14,7 +14,17 @@ from perception.inference.limits import Limits
 from perception.inference.publish import ConditionedView
 from perception.inference.stopwatch import Stopwatch
 from perception.observation.encoder_crop import crop
-from probnerf.inference import asks_encoder, crossings_of, encoder_guess, infer, likelihood_of, modes_of, sampler_of
+from probnerf.inference import (
+    asks_encoder,
+    crossings_of,
+    encoder_guess,
+    further_wall_error,
+    infer,
+    likelihood_of,
+    modes_of,
+    sampler_of,
+    with_wall_error,
+)
 from probnerf.likelihood.settings import Likelihood
 from probnerf.network_start import defensive, network_guess, network_used, picture_density, weigh_draws
 from probnerf.prior.checkpoint import Prior
@@ -24,7 +34,7 @@ from probnerf.prior.posterior_network import EncoderPicture
 from probnerf.sampling.hmc import Reference, StageInfo
 from probnerf.sampling.importance import WeighedDraws
 from probnerf.settings import InferConfig, TemperedSMCConfig
-from probnerf.types import KINDS, Posterior, StopReason
+from probnerf.types import KINDS, Observation, Posterior, StopReason
 
 # Two batches of eigenvalues may wait for each other for ever: each holds a thread of XLA's pool, one per core, until
 _ONE_AT_A_TIME = RLock()  # another thread of that pool has done its parts (jaxlib's ParallelBatchMap)
@@ -51,9 +61,14 @@ class ViewSampler:
     _stage_s: list[float] = field(default_factory=list)  # s; each stage of the latest run
 
     @cached_property
+    def observation(self) -> Observation:
+        """What sampling is conditioned on: the view's, with what the walls of such a thing err by."""
+        return with_wall_error(self.view.observation, further_wall_error(self.config, self.prior.model, self.kinds))
+
+    @cached_property
     def likelihood(self) -> Likelihood:
         """Of the view."""
-        return likelihood_of(self.config, self.view.observation, not self.view.pose_known)
+        return likelihood_of(self.config, self.observation, not self.view.pose_known)
 
     @property
     def smc(self) -> TemperedSMCConfig:
@@ -67,12 +82,12 @@ class ViewSampler:
             return "the samples of an earlier run"
         if self._reference is None:
             return "the prior"
-        return "the encoder's modes" if self._density is None else "the network's draws"
+        return "the network's draws" if self.asks_network else "the encoder's modes"
 
     @property
     def asks_network(self) -> bool:
         """Whether a posterior network tells where to begin."""
-        return self._density is not None
+        return self._tempers_anew and self._density is not None
 
     @property
     def asks_encoder(self) -> bool:
@@ -88,7 +103,7 @@ class ViewSampler:
     @cached_property
     def _density(self) -> PictureDensity | None:
         """The posterior network's density for the view; of several views, for the newest one."""
-        network = network_used(self.config, self.prior) if self._tempers_anew else None
+        network = network_used(self.config, self.prior)
         if network is None:
             return None
         view = self.view
@@ -121,12 +136,13 @@ class ViewSampler:
     def guess(self) -> Posterior:
         """The network's answer without sampling, or the encoder's. Requires `asks_network` or `asks_encoder`."""
         key = jax.random.fold_in(self._key, 1)
-        if self._density is not None:
+        if self.asks_network:
+            assert self._density is not None
             with self.stopwatch.part("network"):
                 return network_guess(key, self._density, self.config.network.guess)
         assert isinstance(self.prior.model, ProbNeRF) and self._picture is not None
         with self.stopwatch.part("climbing"):
-            return encoder_guess(key, self.prior.model, self.likelihood, self.view.observation, self._picture)
+            return encoder_guess(key, self.prior.model, self.likelihood, self.observation, self._picture)
 
     def weigh(self) -> WeighedDraws | None:
         """Have all runs begin at the network's draws, and weigh some of these. None if none may be weighed.
@@ -140,12 +156,12 @@ class ViewSampler:
             return None
         with self.stopwatch.part("network"):
             return weigh_draws(
-                key, self.prior, self.likelihood, self.view.observation, mixture, settings, self.limits.deadline
+                key, self.prior, self.likelihood, self.observation, mixture, settings, self.limits.deadline
             )
 
     def climb(self) -> None:
         """Have all runs begin at the modes that the encoder's guesses climb to."""
-        model, observation, key = self.prior.model, self.view.observation, jax.random.fold_in(self._key, 1)
+        model, observation, key = self.prior.model, self.observation, jax.random.fold_in(self._key, 1)
         with _ONE_AT_A_TIME, self.stopwatch.part("climbing"):
             self._reference = jax.block_until_ready(modes_of(key, model, observation, self.config, self._picture))
         climbed = self.config.modes.gradients(self.likelihood.dim(model))
@@ -189,7 +205,7 @@ class ViewSampler:
             posterior, _ = infer(
                 jax.random.fold_in(self._key, 10 + number) if number else self._key,
                 self.prior.model,
-                self.view.observation,
+                self.observation,
                 self.config,
                 reference=self._reference,
                 before=self.before,
@@ -199,7 +215,7 @@ class ViewSampler:
                 stages=stages,
             )
         self.stages += int(posterior.diagnostics.stages)
-        crossings = crossings_of(self.likelihood, self.view.observation)
+        crossings = crossings_of(self.likelihood, self.observation)
         self.point_gradients += float(posterior.diagnostics.point_gradients) * crossings
         return posterior
 
