@@ -8,7 +8,8 @@ from typing import Any
 from node.ros.bus import Bus
 from node.ros.settings import TopicConfig
 from perception.sources.frame import Frame
-from perception.sources.ros_images import stamp_ns, to_camera, to_depth, to_rgb
+from perception.sources.ros_camera import is_empty, to_camera
+from perception.sources.ros_images import stamp_ns, to_depth, to_rgb
 from perception.sources.stamp_matcher import Match, StampMatcher
 from perception.sources.topic_names import is_rectified
 from perception.sources.topics import doubt, frame_of, not_aligned, other_camera
@@ -86,6 +87,9 @@ class TopicSource:
         return f"no frame for {seconds:.1f} s: {why}; is the driver up, on this domain and with these topic names?"
 
     def _take_info(self, info: Any) -> None:
+        if is_empty(info):
+            self._note("empty", f"camera_info on {self.config.info} is empty: the camera is not calibrated")
+            return
         with self._changed:
             self._info = info
         self._make_frame()

@@ -37,7 +37,7 @@ def read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """The colours (RGB) of a PNG or JPEG. Raises as `read_png`."""
     data = _bytes(path)
     if data.startswith(_JPEG_MAGIC):
-        if b"\xff\xd9" not in data[-64:]:  # its last marker; what is missing would be decoded as grey
+        if not _is_whole_jpeg(data):
             raise ValueError(f"{path} is cut short at byte {len(data)}; copy it again")
         image = _decoded(path, data, "JPEG")
     else:
@@ -107,10 +107,12 @@ def _decoded(path: Path, data: bytes, kind: str) -> Shaped[np.ndarray, "h w *c"]
 def decoded(data: bytes) -> Shaped[np.ndarray, "h w *c"]:
     """The samples of a picture in any of OpenCV's formats, colours as BGR(A). Raises `ValueError` if there is none.
 
-    Of a PNG, size and data are looked at first: OpenCV takes missing pixels for black.
+    Of a PNG, size and data are looked at first, and the end of a JPEG: OpenCV takes missing pixels for black or grey.
     """
     if data.startswith(_PNG_MAGIC):
         _check_png(data)
+    if data.startswith(_JPEG_MAGIC) and not _is_whole_jpeg(data):
+        raise ValueError(f"it is cut short at byte {len(data)}")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     except cv2.error as error:
@@ -118,6 +120,10 @@ def decoded(data: bytes) -> Shaped[np.ndarray, "h w *c"]:
     if image is None:
         raise ValueError("it is no picture, or damaged")
     return image
+
+
+def _is_whole_jpeg(data: bytes) -> bool:
+    return b"\xff\xd9" in data[-64:]  # its last marker
 
 
 def _check_png(data: bytes) -> None:

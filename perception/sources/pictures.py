@@ -9,9 +9,9 @@ from jaxtyping import UInt8
 
 from perception.sources.frame import Frame, Source
 from perception.sources.image_files import colour_to_rgb, decoded, read_png
+from perception.sources.log_messages import first_messages, open_log
 from perception.sources.open_source import VIDEO_SUFFIXES, open_source
 from perception.sources.reader import Reader
-from perception.sources.recording import first_messages, open_log
 from perception.sources.ros_images import to_rgb
 from perception.sources.topics import colour_topic
 

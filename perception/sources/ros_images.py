@@ -1,19 +1,32 @@
-"""Image and camera_info messages as arrays. Messages are read by their fields, whichever library decoded them."""
+"""Image messages as arrays. Messages are read by their fields, whichever library decoded them."""
 
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int32, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
-from calibration.camera import Camera
+from perception.sources.compressed_depth import unpacked
 from perception.sources.frame import known_counts
 from perception.sources.image_files import colour_to_rgb, decoded
 
 POSE_TOPIC = "/camera/color/pose"  # where a Farside recording keeps T_world_camera (geometry_msgs/PoseStamped)
 MM = np.float32(1e-3)
 # Encoding -> sample type and channels.
-COLOURS = {"rgb8": ("u1", 3), "bgr8": ("u1", 3), "rgba8": ("u1", 4), "bgra8": ("u1", 4), "mono8": ("u1", 1)}
+_STRAIGHT = {
+    **{"rgb8": ("u1", 3), "bgr8": ("u1", 3), "rgba8": ("u1", 4), "bgra8": ("u1", 4), "mono8": ("u1", 1)},
+    **{"8UC3": ("u1", 3), "8UC4": ("u1", 4)},  # in OpenCV's order
+    **{"rgb16": ("u2", 3), "bgr16": ("u2", 3), "rgba16": ("u2", 4), "bgra16": ("u2", 4)},
+}
+_BAYER = {f"bayer_{p}{bits}": (f"u{bits // 8}", 1) for p in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)}
+_YUV = {  # by OpenCV's codes
+    **dict.fromkeys(("yuv422", "uyvy"), cv2.COLOR_YUV2RGB_UYVY),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), cv2.COLOR_YUV2RGB_YUYV),
+    "nv12": cv2.COLOR_YUV2RGB_NV12,
+    "nv21": cv2.COLOR_YUV2RGB_NV21,
+}
+COLOURS = _STRAIGHT | _BAYER | {name: ("u1", 1 if name.startswith("nv") else 2) for name in _YUV}
 _ENCODINGS = COLOURS | {"8UC1": ("u1", 1), "mono16": ("u2", 1), "16UC1": ("u2", 1), "32FC1": ("f4", 1)}
 
 
@@ -32,11 +45,17 @@ def encoding_of(message: Any) -> str:
 
 def to_rgb(message: Any) -> UInt8[np.ndarray, "h w 3"]:
     """A colour image. Raises `ValueError` if the message does not hold one."""
-    image = samples(message)
+    encoding = message.encoding if hasattr(message, "encoding") else ""
+    image = _whole(message) if encoding.startswith("nv") else samples(message)
+    if image.dtype == np.uint16 and encoding in COLOURS:
+        image = (image >> 8).astype(np.uint8)
     if image.dtype != np.uint8:
         raise ValueError(f"colour has {image.dtype} samples; record it with 8 bits a channel")
-    straight = hasattr(message, "encoding") and message.encoding.startswith("rgb")
-    return np.ascontiguousarray(image[..., :3]) if straight else colour_to_rgb(image)
+    if encoding in _BAYER:
+        return cv2.cvtColor(image, getattr(cv2, f"COLOR_BAYER_{encoding[6:10].upper()}2RGB"))
+    if encoding in _YUV:
+        return cv2.cvtColor(image, _YUV[encoding])
+    return np.ascontiguousarray(image[..., :3]) if encoding.startswith("rgb") else colour_to_rgb(image)
 
 
 def to_depth(message: Any) -> Float32[np.ndarray, "h w"]:
@@ -53,18 +72,6 @@ def to_label(message: Any) -> Int32[np.ndarray, "h w"]:
     return image.astype(np.int32)
 
 
-def to_camera(info: Any, rectified: bool) -> Camera:
-    """The camera of a CameraInfo, for the raw image, or for the rectified one (then P holds its matrix)."""
-    K, D, P = (getattr(info, name if hasattr(info, name) else name.upper()) for name in "kdp")  # ROS 1 wrote K, D, P
-    if rectified:
-        return Camera(info.width, info.height, np.reshape(P, (3, 4))[:, :3], np.zeros(5))
-    if len(D) == 0:  # no distortion, which a fisheye spells with four zeros
-        fisheye = info.distortion_model in ("equidistant", "fisheye")
-        D, model = (np.zeros(4), "equidistant") if fisheye else (np.zeros(5), "plumb_bob")
-        return Camera(info.width, info.height, np.reshape(K, (3, 3)), D, model)
-    return Camera(info.width, info.height, np.reshape(K, (3, 3)), D, info.distortion_model)
-
-
 def to_transform(pose: Any) -> Float[np.ndarray, "4 4"]:
     """T_frame_thing of a PoseStamped: frame is its header's, thing is what has the pose. `ValueError`: no rotation."""
     p, q = pose.pose.position, pose.pose.orientation
@@ -75,26 +82,32 @@ def to_transform(pose: Any) -> Float[np.ndarray, "4 4"]:
 
 
 def samples(message: Any) -> Shaped[np.ndarray, "h w *c"]:
-    """The samples of an image as they were recorded; a CompressedImage is decoded, to BGR(A) or one channel."""
+    """The samples of an image as they were recorded; a CompressedImage is decoded, to BGR(A) or one channel.
+
+    Of nv12 and nv21 they are the brightness alone.
+    """
+    if hasattr(message, "encoding"):
+        return _whole(message)[: message.height]
     data = np.asarray(message.data, dtype=np.uint8)
-    encoding = encoding_of(message)
-    if not hasattr(message, "encoding"):
-        if "compressedDepth" in message.format:
-            data = data[12:]  # the transport's header, which only 32FC1 needs
-        try:
-            if encoding == "32FC1":
-                raise ValueError("floats are not read")
-            return decoded(data.tobytes())
-        except ValueError as error:
-            raise ValueError(f"cannot decode {message.format!r} ({error}); record it as PNG, JPEG or raw") from None
+    try:
+        return unpacked(message.format, data) if "compressedDepth" in message.format else decoded(data.tobytes())
+    except ValueError as error:
+        raise ValueError(f"cannot decode {message.format!r} ({error}); record it as PNG, JPEG or raw") from None
+
+
+def _whole(message: Any) -> Shaped[np.ndarray, "h w *c"]:
+    """The samples of a raw image; of nv12 and nv21 with the rows of colour, half as many, below."""
+    data, encoding = np.asarray(message.data, dtype=np.uint8), message.encoding
     if encoding not in _ENCODINGS:
         raise ValueError(f"encoding {encoding!r} is not read; record one of {', '.join(_ENCODINGS)}")
     sample, channels = _ENCODINGS[encoding]
     dtype = np.dtype(sample).newbyteorder(">" if message.is_bigendian else "<")
     height, width, size = message.height, message.width, message.width * channels * dtype.itemsize
-    if message.step < size or data.size < message.step * height:
+    height += height // 2 * encoding.startswith("nv")
+    step = size if message.step == 0 and data.size == size * height else message.step  # 0: rows without padding
+    if step < size or data.size < step * height:
         raise ValueError(f"{data.size} bytes do not hold {width}x{height} px of {encoding}; record it again")
-    rows = np.ascontiguousarray(data[: message.step * height].reshape(height, message.step)[:, :size])
+    rows = np.ascontiguousarray(data[: step * height].reshape(height, step)[:, :size])
     image = rows.view(dtype).astype(dtype.newbyteorder("="), copy=False)
     return image.reshape((height, width, channels) if channels > 1 else (height, width))
 

@@ -75,7 +75,9 @@ def colour_topic(path: Path, firsts: Mapping[str, Any], name: str | None = None)
     if not found or (name is not None and name not in found):
         seen = ", ".join(f"{t} ({encoding_of(message)})" for t, message in firsts.items()) or "none"
         what = "no colour image" if name is None else f"no colour image on {name}"
-        raise ValueError(f"{path} has {what} (images: {seen}); record one as {', '.join(COLOURS)} or JPEG")
+        raise ValueError(
+            f"{path} has {what} (images: {seen}); record one as rgb8, bgr8, mono8, bayer, yuv422, nv12 or JPEG"
+        )
     if name is not None:
         return name, []
 

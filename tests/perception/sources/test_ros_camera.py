@@ -1,0 +1,88 @@
+"""A CameraInfo becomes the camera of its image, whatever its lens model is called and whichever part was read."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from perception.sources.ros_camera import is_empty, to_camera
+
+K = np.array([[90.0, 0, 31], [0, 91, 23], [0, 0, 1]])
+BROWN = [0.1, -0.2, 0.01, 0.02, 0.03]
+
+
+def info(model: str, distortion: list[float], **others: Any) -> SimpleNamespace:
+    P = np.column_stack([K * [[2.0], [2.0], [1.0]], np.zeros(3)]).ravel()
+    fields = dict(width=64, height=48, k=K.ravel(), d=np.array(distortion), p=P, distortion_model=model)
+    return SimpleNamespace(**(fields | others))
+
+
+@pytest.mark.parametrize("name", ["equidistant", "fisheye", "KANNALA_BRANDT4"])
+@pytest.mark.parametrize("distortion", [[0.1, -0.2, 0.01, 0.0], []])
+def test_a_fisheye_is_equidistant(name: str, distortion: list[float]) -> None:
+    camera = to_camera(info(name, distortion), rectified=False)
+    assert camera.model == "equidistant"
+    np.testing.assert_array_equal(camera.distortion, distortion or np.zeros(4))
+    # 90 pixels from the middle is an angle of 1, not a tangent of 1.
+    if not distortion:
+        ray = camera.rays(np.array([[31.0 + 90.0, 23.0]]))[0]
+        np.testing.assert_allclose(ray, [np.sin(1.0), 0.0, np.cos(1.0)], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["plumb_bob", "Plumb Bob", "Brown Conrady", "radtan", "rational_polynomial"])
+def test_five_numbers_are_browns_lens_under_any_name(name: str) -> None:
+    px = np.array([[0.0, 0.0], [60.0, 40.0]])
+    camera, brown = (to_camera(info(n, BROWN), rectified=False) for n in (name, "plumb_bob"))
+    np.testing.assert_allclose(camera.rays(px), brown.rays(px), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["", "none", "Inverse Brown Conrady", "rational_polynomial", "sphere"])
+@pytest.mark.parametrize("count", [0, 5])
+def test_zeros_are_no_distortion_whatever_the_name(name: str, count: int) -> None:
+    camera = to_camera(info(name, [0.0] * count), rectified=False)
+    assert camera.model == "plumb_bob" and not camera.distortion.any()
+
+
+def test_lenses_that_are_not_known_are_named() -> None:
+    with pytest.raises(ValueError, match="'sphere' is unknown"):
+        to_camera(info("sphere", BROWN), rectified=False)
+    with pytest.raises(ValueError, match="'Inverse Brown Conrady' maps the other way"):
+        to_camera(info("Inverse Brown Conrady", BROWN), rectified=False)
+
+
+def test_more_coefficients_than_browns_are_a_rational_lens() -> None:
+    for name in ("plumb_bob", "rational_polynomial"):
+        assert to_camera(info(name, [0.1] * 8), rectified=False).model == "rational_polynomial"
+
+
+def test_a_rectified_image_has_the_matrix_p_and_k_where_p_is_empty() -> None:
+    rectified = to_camera(info("equidistant", [0.1] * 4), rectified=True)
+    assert rectified.model == "plumb_bob" and not rectified.distortion.any() and rectified.K[0, 0] == 180.0
+    without = to_camera(info("plumb_bob", BROWN, p=np.zeros(12)), rectified=True)
+    assert without.K[0, 0] == 90.0 and not without.distortion.any()
+
+
+@pytest.mark.parametrize("rectified", [False, True])
+def test_a_part_of_the_sensor_sees_what_the_whole_sees_there(rectified: bool) -> None:
+    roi = SimpleNamespace(x_offset=8, y_offset=4, width=40, height=32, do_rectify=False)
+    whole = to_camera(info("plumb_bob", BROWN), rectified)
+    part = to_camera(info("plumb_bob", BROWN, roi=roi), rectified)
+    assert (part.width, part.height) == (40, 32)
+    px = np.array([[0.0, 0.0], [39.0, 31.0]])
+    np.testing.assert_allclose(part.rays(px), whole.rays(px + np.array([8, 4])), atol=1e-9)
+    # two by two pixels joined: their middle is the new one's
+    joined = to_camera(info("plumb_bob", BROWN, roi=roi, binning_x=2, binning_y=2), rectified)
+    assert (joined.width, joined.height) == (20, 16)
+    np.testing.assert_allclose(joined.rays(px // 2), whole.rays(2 * (px // 2) + np.array([8.5, 4.5])), atol=1e-9)
+
+
+def test_a_roi_and_binning_of_zeros_is_the_whole_sensor() -> None:
+    none = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0, do_rectify=False)
+    camera = to_camera(info("plumb_bob", BROWN, roi=none, binning_x=0, binning_y=0), rectified=False)
+    assert (camera.width, camera.height) == (64, 48)
+    np.testing.assert_array_equal(camera.K, K)
+
+
+def test_an_uncalibrated_camera_is_known() -> None:
+    assert is_empty(info("", [], k=np.zeros(9))) and not is_empty(info("", []))
