@@ -306,11 +306,13 @@ class LiveNode:
             return
         self._told = now
         counts = self.reader.counts()
-        silent = counts.received > 0 and counts.rate < 0.2
+        silent = counts.rate < 0.2
         level: Level = "error" if counts.error else "stale" if silent else "ok"
         values: dict[str, object] = {"received": counts.received, "rate_hz": round(counts.rate, 2)}
         values |= {f"dropped for {name}": n for name, n in counts.dropped.items()}
-        message = counts.error or (counts.notes[-1] if counts.notes else "frames come")
+        message = counts.error or (
+            counts.notes[-1] if counts.notes else "frames come" if counts.received else "no frame yet"
+        )
         statuses = [DiagnosticStatus("farside: camera", level, message, values)]
         if self.recorder is not None:
             r = self.recorder

@@ -85,7 +85,8 @@ def unexplained(h: Hypotheses) -> str:
     """Why an answer is flagged `out_of_model`: the object, or too little time."""
     if h.result in (StopReason.CONVERGED, StopReason.UNDERWAY):
         return "out of model: no shape of the prior explains this view"
-    return f"no shape found so far explains this view: the sampler was cut short ({h.result}); give it more time"
+    cut = f"no shape found so far explains this view: the sampler was cut short ({h.result})"
+    return f"{cut}; give it more time, and check the camera's matrix if that does not help"
 
 
 def warnings(h: Hypotheses) -> list[str]:

@@ -167,6 +167,10 @@ class Recorder:
                 self.bytes = self._stream.tell()
             except Exception as error:  # no error here may end the program
                 self._fail(error)
+                if not isinstance(error, OSError):  # what waits to be written is whole
+                    with suppress(Exception):
+                        self._writer.finish()
+                        self._stream.flush()
         with suppress(OSError):
             self._stream.close()
 
@@ -183,9 +187,10 @@ class Recorder:
 
     def _fail(self, error: Exception) -> None:
         reason = getattr(error, "strerror", None) or one_line(error)
+        remedy = "make room or record elsewhere" if isinstance(error, OSError) else "the disk is not the cause"
         self.error = (
-            f"{self.path}: recording ended at frame {self.frames} ({reason}); make room or record elsewhere; what was"
-            " written before can be read"
+            f"{self.path}: recording ended at frame {self.frames} ({reason}); {remedy}; what was written before can be"
+            " read"
         )
         if self._on_error is not None:
             self._on_error(self.error)

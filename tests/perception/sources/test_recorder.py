@@ -264,6 +264,15 @@ def test_a_full_disk_ends_the_recording_alone(tmp_path: Path) -> None:
         subprocess.run(["umount", tmp_path], check=True)
 
 
+def test_a_stamp_that_no_message_holds_is_no_matter_of_room(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path, wait=True) as recorder:
+        recorder.write_frame(frame(0))
+        recorder.write_frame(replace(frame(1), stamp_ns=2**62))
+    assert recorder.error is not None and "the disk is not the cause" in recorder.error
+    assert "make room" not in recorder.error and len(list(Log(path))) == 1
+
+
 def test_what_cannot_be_begun_is_named(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     record(path, [frame(0)])
