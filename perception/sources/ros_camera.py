@@ -15,6 +15,7 @@ _MODELS = {
 }
 _NAMES = {name: model for model, names in _MODELS.items() for name in names}
 _BROWN, _RATIONAL = 5, 8  # coefficients
+_INVERSE_PX = 0.3
 
 
 def is_empty(info: Any) -> bool:
@@ -37,16 +38,45 @@ def to_camera(info: Any, rectified: bool) -> Camera:
     model = _NAMES.get(name, info.distortion_model)
     if not D.any():  # no distortion, whatever the model's name; a fisheye without is one still
         return _of_image(info, K, np.zeros(4 if model == "equidistant" else _BROWN), _plain(model))
-    if name == "inversebrownconrady":
-        raise ValueError(
-            f"distortion model {info.distortion_model!r} maps the other way and is not read; record the rectified"
-            " image, or calibrate the camera (farside calibrate)"
-        )
+    if name == "inversebrownconrady" and np.isfinite(D).all() and min(K[0, 0], K[1, 1]) > 0:
+        return _of_image(info, K, _inverted(K, D, info.width, info.height), "plumb_bob")
     if model == "rational_polynomial" and len(D) <= _BROWN:  # the same lens without its denominator
         D = np.pad(D, (0, _RATIONAL - len(D)))
     elif model == "plumb_bob" and len(D) >= _RATIONAL:
         model = "rational_polynomial"
     return _of_image(info, K, D, model)
+
+
+def _inverted(
+    K: Float[np.ndarray, "3 3"], D: Float[np.ndarray, "d"], width: int, height: int
+) -> Float[np.ndarray, "5"]:
+    """Brown's coefficients (k1, k2, p1, p2, k3) of librealsense's inverse lens, whose polynomial takes pixels to rays.
+
+    Brown's lens is linear in them, so that least squares over the picture finds the nearest. Raises `ValueError` where
+    that is more than `_INVERSE_PX` off.
+    """
+    u, v = np.meshgrid(np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 33))
+    seen = np.column_stack([(u.ravel() - K[0, 2]) / K[0, 0], (v.ravel() - K[1, 2]) / K[1, 1]])
+    coefficients = np.pad(D[:_BROWN], (0, _BROWN - len(D[:_BROWN])))
+    true = seen + (_brown_terms(seen) @ coefficients).reshape(-1, 2)
+    terms, change = _brown_terms(true), (seen - true).ravel()
+    found = np.linalg.lstsq(terms, change, rcond=None)[0]
+    off = np.abs((terms @ found - change).reshape(-1, 2) * [K[0, 0], K[1, 1]]).max()
+    if not off <= _INVERSE_PX:
+        raise ValueError(
+            f"the inverse Brown-Conrady lens {D.tolist()} is {off:.1f} px off Brown's; record the rectified image, or"
+            " calibrate the camera (farside calibrate)"
+        )
+    return found
+
+
+def _brown_terms(xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 5"]:
+    """What each of Brown's coefficients (k1, k2, p1, p2, k3) adds to x and y, in turn (m = 2n rows)."""
+    x, y = xy.T
+    r2 = x * x + y * y
+    along_x = (x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3)
+    along_y = (y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3)
+    return np.stack([along_x, along_y], axis=-1).transpose(1, 2, 0).reshape(-1, _BROWN)
 
 
 def _plain(model: str) -> str:

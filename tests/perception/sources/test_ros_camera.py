@@ -47,8 +47,29 @@ def test_zeros_are_no_distortion_whatever_the_name(name: str, count: int) -> Non
 def test_lenses_that_are_not_known_are_named() -> None:
     with pytest.raises(ValueError, match="'sphere' is unknown"):
         to_camera(info("sphere", BROWN), rectified=False)
-    with pytest.raises(ValueError, match="'Inverse Brown Conrady' maps the other way"):
-        to_camera(info("Inverse Brown Conrady", BROWN), rectified=False)
+    with pytest.raises(ValueError, match=r"inverse Brown-Conrady lens .* px off"):
+        to_camera(info("Inverse Brown Conrady", [-3.0, 9.0, 0.0, 0.0, 0.0]), rectified=False)
+    for wrong in (info("Inverse Brown Conrady", [np.nan] * 5), info("Inverse Brown Conrady", BROWN, k=np.eye(3) * 0)):
+        with pytest.raises(ValueError, match=r"unknown|positive focal"):
+            to_camera(wrong, rectified=False)
+
+
+def test_librealsenses_inverse_lens_takes_pixels_to_the_same_rays() -> None:
+    """As `rs2_deproject_pixel_to_point` does (librealsense, src/rs.cpp)."""
+    k = [-0.055, 0.066, -0.0004, 0.0003, -0.021]
+    matrix = np.array([[384.0, 0, 320], [0, 384, 240], [0, 0, 1]])
+    wide = info("Inverse Brown Conrady", k, k=matrix.ravel(), width=640, height=480)
+    camera = to_camera(wide, rectified=False)
+    for px in ([0.0, 0.0], [320.0, 240.0], [639.0, 100.0], [200.0, 479.0]):
+        x, y = (px[0] - 320) / 384, (px[1] - 240) / 384
+        r2 = x * x + y * y
+        f = 1 + k[0] * r2 + k[1] * r2 * r2 + k[4] * r2 * r2 * r2
+        point = [
+            x * f + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x),
+            y * f + 2 * k[3] * x * y + k[2] * (r2 + 2 * y * y),
+            1,
+        ]
+        assert np.linalg.norm(camera.project(np.array([point]))[0] - px) < 0.3
 
 
 def test_more_coefficients_than_browns_are_a_rational_lens() -> None:
