@@ -83,6 +83,7 @@ class Recorder:
             enable_data_crcs=True,
         )
         self._writer.start(profile="ros2", library="farside")
+        self._log_ns = 0  # the latest time in the log
         self._channels: dict[str, int] = {}  # by topic
         self._schemas: dict[str, int] = {}  # by message type
         self._types: dict[str, str] = {}  # message type of each topic that was handed over
@@ -183,7 +184,8 @@ class Recorder:
             metadata = {"offered_qos_profiles": ""}
             channel = self._writer.register_channel(message.topic, "cdr", self._schemas[message.kind], metadata)
             self._channels[message.topic] = channel
-        self._writer.add_message(self._channels[message.topic], message.stamp_ns, message.data, message.stamp_ns)
+        self._log_ns = max(self._log_ns, message.stamp_ns)  # players take a log's time for one that only rises
+        self._writer.add_message(self._channels[message.topic], self._log_ns, message.data, message.stamp_ns)
 
     def _fail(self, error: Exception) -> None:
         reason = getattr(error, "strerror", None) or one_line(error)

@@ -111,11 +111,13 @@ class Log:
         self._pairing_notes = []
         frames, unlabelled, first_ns, at = 0, 0, None, 0.0
         broken: list[str] = []
+        fallen = 0.0  # s; largest jump back of the stamps
         gaps: list[float] = []  # of the colour images that found no depth, ms
         for match in self._matches():
             colour, camera = match.lead
             first_ns = colour.stamp if first_ns is None else first_ns
-            at = (colour.stamp - first_ns) / 1e9
+            fallen = max(fallen, at - (colour.stamp - first_ns) / 1e9)
+            at = max(at, (colour.stamp - first_ns) / 1e9)  # a camera's clock may be set back
             if not start_s <= at <= end_s:
                 if frames and at > end_s:
                     break
@@ -152,6 +154,8 @@ class Log:
             self._pairing_notes.append(
                 f"{self.path.name}: {len(gaps)} colour images without depth within {limit} skipped"
             )
+        if fallen > 0.0:
+            self._pairing_notes.append(f"{self.path.name}: stamps jump back by {fallen:.3g} s; frames keep their order")
         if unlabelled:
             self._pairing_notes.append(f"{self.path.name}: {unlabelled} of {frames} frames have no label image")
 

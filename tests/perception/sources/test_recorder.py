@@ -264,6 +264,19 @@ def test_a_full_disk_ends_the_recording_alone(tmp_path: Path) -> None:
         subprocess.run(["umount", tmp_path], check=True)
 
 
+def test_log_times_rise_where_the_cameras_clock_jumps_back(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    written = [replace(frame(i), stamp_ns=START + 33_000_000 * i - 10_000_000_000 * (i > 2)) for i in range(6)]
+    record(path, written)
+    with path.open("rb") as stream:
+        times = [message.log_time for _, _, message in make_reader(stream).iter_messages(log_time_order=False)]
+    assert times == sorted(times)
+    log = Log(path)
+    for read, was in zip(log, written, strict=True):
+        same(read, was)
+    assert "stamps jump back by 9.97 s" in log.notes[-1]
+
+
 def test_a_stamp_that_no_message_holds_is_no_matter_of_room(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with Recorder(path, wait=True) as recorder:
