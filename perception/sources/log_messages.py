@@ -4,6 +4,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -15,13 +16,13 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from foundation.one_line import one_line
-from perception.sources.ros_camera import is_empty
+from perception.sources.ros_camera import to_camera
 from perception.sources.ros_images import samples, stamp_ns
 
 _KINDS = tuple(f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 _IMAGE, _COMPRESSED, INFO = _KINDS
 _TYPES = get_typestore(Stores.ROS2_HUMBLE)
-_TRIES = 30
+_TRIES = 300  # messages of a topic, as many as a driver sends while it starts
 _MAGIC = b"\x89MCAP0\r\n"
 
 
@@ -63,10 +64,10 @@ def first_messages(read: Read, kinds: dict[str, str]) -> dict[str, Received]:
 
 def _is_usable(received: Received) -> bool:
     """Neither an empty camera_info, which a driver sends until it has read its calibration, nor a cut picture."""
-    if received.kind == INFO:
-        return not is_empty(received.message)
     try:
-        return received.kind == _IMAGE or samples(received.message).size > 0
+        if received.kind == INFO:
+            return to_camera(received.message, False).width > 0
+        return samples(received.message).size > 0
     except ValueError:
         return False
 
@@ -75,43 +76,98 @@ def open_log(path: Path) -> tuple[Read, dict[str, str], list[str]]:
     """A function that reads messages, the type of each topic that holds any, and notes."""
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; give a recording (.mcap, .bag, ROS 2 bag folder)")
+    parts, notes = [path], list[str]()
     if path.is_dir() and not (path / "metadata.yaml").exists():  # as a recorder leaves it that was killed
-        parts = _parts(path)
-        if not parts:
-            raise ValueError(f"{path} holds neither color.png nor a recording; give a frame folder or a recording")
-    else:
-        parts = [path]
+        parts, notes = _parts(path)
 
     def read(topics: set[str]) -> Iterator[Received]:
+        lost = _Lost(path, notes)
         try:
             with AnyReader(parts, default_typestore=_TYPES) as reader:
                 wanted = [c for c in reader.connections if c.topic in topics]
                 for connection, time, raw in reader.messages(wanted) if wanted else ():
                     kind = connection.msgtype
-                    message: Any = reader.deserialize(raw, kind)
-                    if lacks := _fields(kind) - {name.lower() for name in message.__dataclass_fields__}:
-                        raise ValueError(f"its definition of {kind} lacks {', '.join(sorted(lacks))}")
-                    yield Received(connection.topic, kind, time, message)
+                    with lost.counted(connection.topic):
+                        message: Any = reader.deserialize(raw, kind)
+                        if lacks := _fields(kind) - {name.lower() for name in message.__dataclass_fields__}:
+                            raise ValueError(f"its definition of {kind} lacks {', '.join(sorted(lacks))}")
+                    if not lost.this_one:
+                        yield Received(connection.topic, kind, time, message)
+            lost.refuse_all()
         except Exception as error:  # whichever parser meets the damage first; the caller's own errors do not pass here
             raise ValueError(f"{path} is damaged ({one_line(error)}); record it again") from None
 
     try:
         with AnyReader(parts, default_typestore=_TYPES) as reader:
-            return read, {c.topic: c.msgtype for c in reader.connections if c.msgcount}, []
+            return read, {c.topic: c.msgtype for c in reader.connections if c.msgcount}, notes
     except Exception as error:
-        mcaps = [part for part in (_parts(path) if path.is_dir() else [path]) if part.suffix == ".mcap"]
+        mcaps = [part for part in (_parts(path)[0] if path.is_dir() else [path]) if part.suffix == ".mcap"]
         if mcaps:
-            return _open_cut(mcaps)
-        remedy = (
-            "repair it with `rosbag reindex`" if path.suffix == ".bag" else "give a .mcap, .bag or ROS 2 bag folder"
-        )
+            return _open_cut(path, mcaps, notes)
+        remedy = "give a .mcap, .bag or ROS 2 bag folder"
+        if path.suffix == ".zstd":
+            remedy = "unpack it with `zstd -d`"
+        elif path.suffix == ".bag" or path.name.endswith(".bag.active"):
+            remedy = "repair it with `rosbag reindex`"
+        elif path.is_dir():
+            remedy = "repair it with `ros2 bag reindex`, or remove its metadata.yaml"
         raise ValueError(f"{path} cannot be read as a recording ({one_line(error)}); {remedy}") from None
 
 
-def _parts(folder: Path) -> list[Path]:
-    """The files of a recording in the order of their numbers: a_2 comes before a_10."""
-    found = (p for p in folder.iterdir() if p.suffix in (".mcap", ".db3"))
-    return sorted(found, key=lambda p: [(int(n), "") if n.isdigit() else (-1, n) for n in re.split(r"(\d+)", p.name)])
+class _Lost:
+    """Messages that cannot be read: they cost themselves, with a note; but not all of a topic may be lost."""
+
+    def __init__(self, path: Path, notes: list[str]) -> None:
+        self.this_one = False
+        self._path, self._notes = path, notes
+        self._good: Counter[str] = Counter()
+        self._bad: dict[str, str] = {}
+
+    @contextmanager
+    def counted(self, topic: str) -> Iterator[None]:
+        """Read one message within."""
+        self.this_one = False
+        try:
+            yield
+            self._good[topic] += 1
+        except Exception as error:
+            self.this_one = True
+            self._bad.setdefault(topic, one_line(error))
+            note = f"{self._path.name}: messages on {topic} that cannot be read are left out ({self._bad[topic]})"
+            if note not in self._notes:
+                self._notes.append(note)
+
+    def refuse_all(self) -> None:
+        """Raises ValueError for a topic of which nothing can be read."""
+        for topic, why in self._bad.items():
+            if topic not in self._good:
+                raise ValueError(why)
+
+
+def _parts(folder: Path) -> tuple[list[Path], list[str]]:
+    """The files of a recording in the order of their numbers, a_2 before a_10, and a note if some are missing.
+
+    Raises ValueError if there is none, or there are several recordings.
+    """
+    found: dict[str, list[tuple[int, Path]]] = {}
+    for p in folder.iterdir():
+        if p.suffix in (".mcap", ".db3"):
+            name, number = re.fullmatch(r"(.*?)_?(\d*)", p.stem).groups()  # type: ignore[union-attr]
+            found.setdefault(name, []).append((int(number or 0), p))
+    if not found:
+        packed = "; unpack its parts with `zstd -d`" if any(folder.glob("*.zstd")) else ""
+        raise ValueError(
+            f"{folder} holds neither color.png nor a recording; give a frame folder or a recording{packed}"
+        )
+    if len(found) > 1:
+        names = ", ".join(sorted(p.name for parts in found.values() for _, p in parts))
+        raise ValueError(f"{folder} holds several recordings ({names}); give one")
+    ((name, parts),) = found.items()
+    parts.sort()
+    numbers = {number for number, _ in parts}
+    missing = sorted(set(range(max(numbers) + 1)) - numbers) if len(parts) > 1 or 0 not in numbers else []
+    told = ", ".join(f"{name}_{n}" for n in missing[:5]) + (", ..." if len(missing) > 5 else "")
+    return [p for _, p in parts], [f"{folder.name}: parts are missing ({told})"] if missing else []
 
 
 @cache
@@ -120,7 +176,7 @@ def _fields(kind: str) -> frozenset[str]:
     return frozenset(name.lower() for name, _ in _TYPES.fielddefs[kind][1]) if kind in _TYPES.fielddefs else frozenset()
 
 
-def _open_cut(paths: list[Path]) -> tuple[Read, dict[str, str], list[str]]:
+def _open_cut(whole: Path, paths: list[Path], notes: list[str]) -> tuple[Read, dict[str, str], list[str]]:
     """The same for MCAP files that the indexed reader refuses, read from the front for as long as they last."""
 
     unread: set[str] = set()  # encodings
@@ -144,13 +200,16 @@ def _open_cut(paths: list[Path]) -> tuple[Read, dict[str, str], list[str]]:
                 return
 
     def read(topics: set[str]) -> Iterator[Received]:
+        lost = _Lost(whole, notes)
         for path in paths:
-            for topic, kind, message in records(path):
+            for topic, kind, raw in records(path):
                 if topic in topics:
-                    yield Received(topic, kind, message.log_time, _TYPES.deserialize_cdr(message.data, kind))
+                    with lost.counted(topic):
+                        message = _TYPES.deserialize_cdr(raw.data, kind)
+                    if not lost.this_one:
+                        yield Received(topic, kind, raw.log_time, message)
 
     kinds: dict[str, str] = {}
-    notes = []
     for path in paths:
         count = 0
         for topic, kind, _ in records(path):

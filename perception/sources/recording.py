@@ -9,7 +9,7 @@ import numpy as np
 from calibration.camera import Camera
 from perception.sources.frame import Frame
 from perception.sources.log_messages import INFO, Received, first_messages, open_log
-from perception.sources.ros_camera import is_empty, to_camera
+from perception.sources.ros_camera import to_camera
 from perception.sources.ros_images import (
     POSE_TOPIC,
     stamp_ns,
@@ -23,7 +23,14 @@ from perception.sources.stamp_matcher import Match, StampMatcher
 from perception.sources.topic_names import TopicNames, is_rectified
 from perception.sources.topics import choose, frame_of, other_camera
 
-_VIDEO = ("/FFMPEGPacket", "/CompressedVideo")
+_NOT_READ = (
+    "FFMPEGPacket",
+    "CompressedVideo",
+    "theora_image_transport/msg/Packet",
+    "foxglove_msgs/msg/RawImage",
+    "foxglove_msgs/msg/CompressedImage",
+)
+_WAITING = 150  # colour images that may wait for depth which is recorded late
 
 
 class Log:
@@ -49,6 +56,7 @@ class Log:
         self.path = Path(path)
         self.tolerance_ns = tolerance_ns
         self._pairing_notes: list[str] = []
+        self._unread_infos: dict[str, None] = {}  # why, in the order of their coming
         self._read, kinds, self._notes = open_log(self.path)
         firsts = first_messages(self._read, kinds)
         images = {topic: first.message for topic, first in firsts.items() if first.kind != INFO}
@@ -56,8 +64,11 @@ class Log:
         try:
             chosen = choose(self.path, images, infos, names or TopicNames())
         except ValueError as error:
-            videos = [f"{topic} ({kind})" for topic, kind in kinds.items() if kind.endswith(_VIDEO)]
-            raise ValueError(f"{error}; video packets are not read: {', '.join(videos)}" if videos else error) from None
+            others = [f"{topic} ({kind})" for topic, kind in kinds.items() if kind.endswith(_NOT_READ)]
+            if not others:
+                raise
+            what = "video packets and Foxglove's images are not read"
+            raise ValueError(f"{error}; {what}: {', '.join(others)}") from None
         self.colour_topic, self.depth_topic, self.label_topic = chosen.colour, chosen.depth, chosen.label
         self.info_topic = chosen.info
         self._notes += chosen.notes
@@ -71,7 +82,7 @@ class Log:
                 f"{self.path} has no camera_info; record the camera_info topic beside {self.colour_topic}, or give a"
                 " camera file (--camera)"
             )
-        self._pose_topic = POSE_TOPIC if POSE_TOPIC in kinds else None
+        self._pose_topic = POSE_TOPIC if kinds.get(POSE_TOPIC) == "geometry_msgs/msg/PoseStamped" else None
         paired = [topic for topic in (chosen.colour, chosen.depth, chosen.label) if topic]
         unstamped = [topic for topic in paired if not stamp_ns(firsts[topic].message)]
         self._by_log_time = bool(unstamped)
@@ -108,7 +119,7 @@ class Log:
 
         Raises `ValueError`, with the log's actual range, if it has no such frame.
         """
-        self._pairing_notes = []
+        self._pairing_notes, self._unread_infos = [], {}
         frames, unlabelled, first_ns, at = 0, 0, None, 0.0
         broken: list[str] = []
         fallen = 0.0  # s; largest jump back of the stamps
@@ -154,6 +165,8 @@ class Log:
             self._pairing_notes.append(
                 f"{self.path.name}: {len(gaps)} colour images without depth within {limit} skipped"
             )
+        if self._unread_infos:
+            self._pairing_notes.append(f"a camera_info is left out: {next(iter(self._unread_infos))}")
         if fallen > 0.0:
             self._pairing_notes.append(f"{self.path.name}: stamps jump back by {fallen:.3g} s; frames keep their order")
         if unlabelled:
@@ -162,12 +175,15 @@ class Log:
     def _matches(self) -> Iterator[Match[tuple[Received, Camera], Received]]:
         """Every colour image with its camera and, by topic, the partner nearest in stamp."""
         streams = [topic for topic in (self.depth_topic, self.label_topic, self._pose_topic) if topic]
-        matcher: StampMatcher[tuple[Received, Camera], Received] = StampMatcher(streams, self.tolerance_ns)
+        matcher: StampMatcher[tuple[Received, Camera], Received] = StampMatcher(streams, self.tolerance_ns, _WAITING)
         camera = self._first_camera
         for received in self._read({self.colour_topic, *filter(None, [self.info_topic]), *streams}):
             received = replace(received, by_log_time=self._by_log_time)
             if received.topic == self.info_topic:
-                camera = camera if is_empty(received.message) else self._camera(received)
+                try:
+                    camera = self._camera(received)
+                except ValueError as error:  # the one before is good still
+                    self._unread_infos[str(error)] = None
             elif received.topic == self.colour_topic:
                 yield from matcher.push_lead(received.stamp, (received, camera))
             else:

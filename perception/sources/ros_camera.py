@@ -40,10 +40,12 @@ def to_camera(info: Any, rectified: bool) -> Camera:
         return _of_image(info, K, np.zeros(4 if model == "equidistant" else _BROWN), _plain(model))
     if name == "inversebrownconrady" and np.isfinite(D).all() and min(K[0, 0], K[1, 1]) > 0:
         return _of_image(info, K, _inverted(K, D, info.width, info.height), "plumb_bob")
-    if model == "rational_polynomial" and len(D) <= _BROWN:  # the same lens without its denominator
+    if model == "rational_polynomial" and len(D) < _RATIONAL:  # the last coefficients are zero
         D = np.pad(D, (0, _RATIONAL - len(D)))
     elif model == "plumb_bob" and len(D) >= _RATIONAL:
         model = "rational_polynomial"
+    elif model == "equidistant" and not D[4:].any():  # some drivers fill up with zeros
+        D = D[:4]
     return _of_image(info, K, D, model)
 
 

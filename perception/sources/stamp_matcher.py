@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
+_RESTART_NS = 200_000_000  # more than messages that overtake each other
 Lead = TypeVar("Lead")
 Partner = TypeVar("Partner")
 
@@ -31,8 +32,10 @@ class StampMatcher(Generic[Lead, Partner]):
     """For each item of a leading stream, the item nearest in stamp of every partner stream, within a tolerance.
 
     Stamps rise within a stream, so a partner no older than the leading item ends its search; without one it waits for
-    `waiting` more leading items at most. Of each partner stream `kept` items may wait (None: any number). A partner may
-    match two leading items. `unused` counts, by stream, dropped partners that matched none.
+    `waiting` more leading items at most. Where a stream falls by more than `_RESTART_NS` (a clock set back, a
+    simulation begun anew), all that waits is matched among itself, and nothing from before is kept. Of each partner
+    stream `kept` items may wait (None: any number). A partner may match two leading items. `unused` counts, by stream,
+    dropped partners that matched none.
     """
 
     def __init__(self, streams: Sequence[str], tolerance_ns: int, waiting: int = 30, kept: int | None = None) -> None:
@@ -42,18 +45,29 @@ class StampMatcher(Generic[Lead, Partner]):
         self.unused = dict.fromkeys(streams, 0)
         self._most_waiting, self._most_kept = waiting, kept
         self._leads: deque[tuple[int, Lead]] = deque()
+        self._newest: float = float("-inf")  # stamp of the leading stream
         self._partners: dict[str, deque[_Waiting[Partner]]] = {stream: deque() for stream in streams}
 
     def push_lead(self, stamp_ns: int, item: Lead) -> list[Match[Lead, Partner]]:
         """Add an item of the leading stream. Returns the matches that it settles."""
+        before: list[Match[Lead, Partner]] = []
+        if stamp_ns < self._newest - _RESTART_NS:
+            before = self.rest()
+            for stream, queue in self._partners.items():
+                if queue and abs(queue[-1].stamp_ns - stamp_ns) > _RESTART_NS:  # it has not begun anew yet
+                    self._clear(stream)
+        self._newest = stamp_ns
         self._leads.append((stamp_ns, item))
-        return self._settled()
+        return before + self._settled()
 
     def push_partner(self, stream: str, stamp_ns: int, item: Partner) -> list[Match[Lead, Partner]]:
         """Add an item of a partner stream. Returns the matches that it settles."""
-        queue = self._partners[stream]
+        queue, before = self._partners[stream], list[Match[Lead, Partner]]()
+        if queue and stamp_ns < queue[-1].stamp_ns - _RESTART_NS:
+            before = self.rest()
+            self._clear(stream)
         queue.append(_Waiting(stamp_ns, item))
-        settled = self._settled()
+        settled = before + self._settled()
         while self._most_kept is not None and len(queue) > self._most_kept:
             self._forget(stream)
         return settled
@@ -85,6 +99,10 @@ class StampMatcher(Generic[Lead, Partner]):
                 best.used = True
                 partners[stream] = best.item
         return Match(lead, partners, gaps)
+
+    def _clear(self, stream: str) -> None:
+        while self._partners[stream]:
+            self._forget(stream)
 
     def _forget(self, stream: str) -> None:
         self.unused[stream] += not self._partners[stream].popleft().used

@@ -13,15 +13,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from perception.sources.ros_images import COLOURS, encoding_of, samples, to_depth
+from perception.sources.ros_images import COLOURS, encoding_of, samples, to_depth, to_label
 from perception.sources.topic_names import NO_DEPTH_PARTS, TopicNames, name_parts
 
 _COLOUR_PARTS = {"color", "colour", "rgb"}
 _LABEL_PARTS = {"label", "labels", "segmentation"}
 _NO_PICTURE_PARTS = {"confidence", "uncertainty", "mask", "disparity", "depth"}
 _INFRARED_PARTS = {"ir", "infra", "infrared", "thermal"}
-_LABEL_ENCODINGS = ("mono8", "8UC1", "mono16", "16UC1")
+_LABEL_ENCODINGS = ("mono8", "8UC1", "mono16", "16UC1", "32SC1")
 _TRANSPORTS = {"compressed", "compressedDepth"}
+_USUAL = {"image", "image_raw", "image_color", "image_rect", "image_rect_color"}
 _NEAREST_M, _FARTHEST_M = 0.01, 50.0  # between which the median of a depth image of things on a table lies
 
 
@@ -71,7 +72,9 @@ def colour_topic(path: Path, firsts: Mapping[str, Any], name: str | None = None)
 
     `name` is the requested topic.
     """
-    found = [t for t, m in firsts.items() if encoding_of(m) in COLOURS and (t == name or _is_picture(t))]
+    found = [
+        t for t, m in firsts.items() if encoding_of(m) in COLOURS and (t == name or _is_picture(t, encoding_of(m)))
+    ]
     if not found or (name is not None and name not in found):
         seen = ", ".join(f"{t} ({encoding_of(message)})" for t, message in firsts.items()) or "none"
         what = "no colour image" if name is None else f"no colour image on {name}"
@@ -81,15 +84,24 @@ def colour_topic(path: Path, firsts: Mapping[str, Any], name: str | None = None)
     if name is not None:
         return name, []
 
+    depths, _ = _named_depth(path, firsts)
+
     def rank(topic: str) -> tuple[bool, ...]:  # infrared is mono8 too; what this node passed on is a copy
-        own = "farside" in topic.split("/")
-        return encoding_of(firsts[topic]) != "mono8", not own, bool(_COLOUR_PARTS & name_parts(topic))
+        image, own = firsts[topic], "farside" in topic.split("/")
+        paired = any(_is_of(firsts[d], image, _kinship(d, topic)) for d in depths)
+        usual = _segments(topic)[-1] in _USUAL  # a driver's, not somebody's overlay
+        return encoding_of(image) != "mono8", not own, paired, bool(_COLOUR_PARTS & name_parts(topic)), usual
 
     best = max(found, key=lambda t: (*rank(t), hasattr(firsts[t], "encoding")))  # a raw picture needs no decoding
-    frame = frame_of(firsts[best])
-    others = [t for t in found if rank(t) == rank(best) and frame_of(firsts[t]) != frame]
+    others = [t for t in found if rank(t)[:2] == rank(best)[:2] and _segments(t) != _segments(best)]
     notes = [f"{path.name}: colour is also on {', '.join(others)}; {best} is taken (choose with --colour-topic)"]
     return best, notes if others else []
+
+
+def _is_of(depth: Any, colour: Any, kinship: int) -> bool:
+    """Whether a depth image may be that of a colour image: of its frame_id, or without one of its namespace."""
+    a, b = frame_of(depth), frame_of(colour)
+    return a == b if a and b else kinship > 0
 
 
 def choose(path: Path, images: Mapping[str, Any], infos: Mapping[str, Any], names: TopicNames) -> Chosen:
@@ -100,16 +112,42 @@ def choose(path: Path, images: Mapping[str, Any], infos: Mapping[str, Any], name
     """
     colour, notes = colour_topic(path, images, names.colour)
     depth, about_depth = _depth_topic(path, images, colour, names.depth)
-    named = {t: m for t, m in images.items() if _LABEL_PARTS & name_parts(t)}
-    labels = [
-        t for t, m in named.items() if encoding_of(m) in _LABEL_ENCODINGS and not_aligned(m, images[colour]) is None
-    ]
-    label = max(labels, key=lambda t: _kinship(t, colour), default=None)
-    return Chosen(colour, depth, label, _info_topic(path, infos, images, colour), (*notes, *about_depth))
+    label, about_labels = _label_topic(path, images, colour)
+    notes = [*notes, *about_depth, *about_labels]
+    return Chosen(colour, depth, label, _info_topic(path, infos, images, colour), tuple(notes))
 
 
-def _is_picture(topic: str) -> bool:
-    return not (_LABEL_PARTS | _NO_PICTURE_PARTS) & name_parts(topic) or bool(_COLOUR_PARTS & name_parts(topic))
+def _label_topic(path: Path, images: Mapping[str, Any], colour: str) -> tuple[str | None, list[str]]:
+    """The label map of colour's camera and size, and notes on others that may be meant."""
+    fitting, notes = [], []
+    for topic, message in images.items():
+        if not _LABEL_PARTS & name_parts(topic) or encoding_of(message) not in _LABEL_ENCODINGS:
+            continue
+        if not_aligned(message, images[colour]) is None:
+            why = _no_labels(message, images[colour])
+            notes += [f"{path.name}: {topic} is not taken for labels: {why}"] if why else []
+            fitting += [] if why else [topic]
+    return max(fitting, key=lambda t: _kinship(t, colour), default=None), notes
+
+
+def _no_labels(message: Any, colour: Any) -> str | None:
+    """The reason why an image is no label map of a colour image."""
+    if "jp" in getattr(message, "format", ""):
+        return "JPEG changes ids; record it as mono8, 16UC1 or PNG"
+    try:
+        size, wanted = to_label(message).shape, samples(colour).shape[:2]
+    except ValueError as error:
+        return str(error)
+    return None if size == wanted else f"it is {size[1]}x{size[0]} px, colour {wanted[1]}x{wanted[0]}"
+
+
+def _is_picture(topic: str, encoding: str) -> bool:
+    """Whether a topic's name allows colour. Of what has colours for certain, only its own name counts."""
+    whole = name_parts(topic)
+    if encoding == "mono8":
+        return not (_LABEL_PARTS | _NO_PICTURE_PARTS) & whole or bool(_COLOUR_PARTS & whole)
+    own = name_parts(_segments(topic)[-1])
+    return not (_LABEL_PARTS | _NO_PICTURE_PARTS) & own
 
 
 def _depth_topic(path: Path, images: Mapping[str, Any], colour: str, name: str | None) -> tuple[str | None, list[str]]:
@@ -120,7 +158,15 @@ def _depth_topic(path: Path, images: Mapping[str, Any], colour: str, name: str |
     else:
         found, notes = _named_depth(path, images)
     size = _size(path, colour, images[colour])
-    sizes = {t: _size(path, t, images[t]) for t in found}
+    sizes = dict[str, str]()
+    for t in found:
+        try:
+            sizes[t] = _size(path, t, images[t])
+        except ValueError as error:
+            if t == name or len(found) == 1:
+                raise
+            notes.append(f"{t} is not taken for depth: {error}")
+    found = list(sizes)
     fitting = [t for t in found if sizes[t] == size]
     if found and not fitting:
         raise ValueError(
@@ -154,6 +200,9 @@ def _named_depth(path: Path, images: Mapping[str, Any]) -> tuple[list[str], list
     for topic, message in images.items():
         parts, encoding = name_parts(topic), encoding_of(message)
         if encoding not in ("16UC1", "mono16", "32FC1") or parts & (_LABEL_PARTS | NO_DEPTH_PARTS):
+            continue
+        own = name_parts(" ".join(_segments(topic)[-2:]))  # a depth camera's other images have its name, too
+        if own & _INFRARED_PARTS and "depth" not in own:
             continue
         if "depth" in parts or "compressedDepth" in getattr(message, "format", ""):
             found.append(topic)
