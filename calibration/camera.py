@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 # Lengths of OpenCV's distortion vector for each ROS model name.
-_DISTORTION_LENGTHS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
+DISTORTION_LENGTHS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 # Undistortion is iterative; OpenCV's default of 5 steps leaves up to a pixel at the corners of a wide lens.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)
 _INVERSE_TOLERANCE_PX = 0.05
@@ -42,10 +42,10 @@ class Camera:
         if not np.allclose(K[2], [0.0, 0.0, 1.0]):
             raise ValueError(f"camera matrix has last row {K[2].tolist()}; it must be 0 0 1 (is it transposed?)")
         model = "equidistant" if self.model == "fisheye" else self.model
-        if model not in _DISTORTION_LENGTHS:
-            raise ValueError(f"distortion model {model!r} is unknown; use {' or '.join(_DISTORTION_LENGTHS)}")
+        if model not in DISTORTION_LENGTHS:
+            raise ValueError(f"distortion model {model!r} is unknown; use {' or '.join(DISTORTION_LENGTHS)}")
         distortion = np.array(self.distortion, dtype=np.float64).ravel()
-        lengths = _DISTORTION_LENGTHS[model]
+        lengths = DISTORTION_LENGTHS[model]
         if distortion.size not in lengths or not np.isfinite(distortion).all():
             wanted = " or ".join(map(str, lengths))
             raise ValueError(f"distortion {distortion.tolist()} does not fit {model}: {wanted} finite numbers wanted")

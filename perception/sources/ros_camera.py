@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from calibration.camera import Camera
+from calibration.camera import DISTORTION_LENGTHS, Camera
 
 # Drivers' names of lens models, in small letters without spaces and underscores, by ROS's own.
 _MODELS = {
@@ -37,7 +37,10 @@ def to_camera(info: Any, rectified: bool) -> Camera:
     name = info.distortion_model.lower().replace(" ", "").replace("_", "")
     model = _NAMES.get(name, info.distortion_model)
     if not D.any():  # no distortion, whatever the model's name; a fisheye without is one still
-        return _of_image(info, K, np.zeros(4 if model == "equidistant" else _BROWN), _plain(model))
+        if len(D) not in DISTORTION_LENGTHS.get(model, ()):
+            model = "equidistant" if model == "equidistant" else "plumb_bob"
+            D = np.zeros(DISTORTION_LENGTHS[model][-1])
+        return _of_image(info, K, D, model)
     if name == "inversebrownconrady" and np.isfinite(D).all() and min(K[0, 0], K[1, 1]) > 0:
         return _of_image(info, K, _inverted(K, D, info.width, info.height), "plumb_bob")
     if model == "rational_polynomial" and len(D) < _RATIONAL:  # the last coefficients are zero
@@ -81,10 +84,6 @@ def _brown_terms(xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 5"]:
     return np.stack([along_x, along_y], axis=-1).transpose(1, 2, 0).reshape(-1, _BROWN)
 
 
-def _plain(model: str) -> str:
-    return "equidistant" if model == "equidistant" else "plumb_bob"
-
-
 def _matrices(info: Any) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "d"], Float[np.ndarray, "12"]]:
     K, D, P = (getattr(info, name if hasattr(info, name) else name.upper()) for name in "kdp")  # ROS 1 wrote K, D, P
     return np.reshape(K, (3, 3)).astype(np.float64), np.asarray(D, np.float64), np.asarray(P, np.float64)
@@ -99,6 +98,7 @@ def _of_image(info: Any, K: Float[np.ndarray, "3 3"], D: Float[np.ndarray, "d"],
     joined = np.array([max(getattr(info, f"binning_{axis}", 1), 1) for axis in "xy"])
     K = K.copy()
     K[:2, 2] -= first
-    K[:2, :2] /= joined[:, None]
-    K[:2, 2] = (K[:2, 2] + 0.5) / joined - 0.5  # pixel centres are whole numbers
+    if (joined > 1).any():
+        K[:2, :2] /= joined[:, None]
+        K[:2, 2] = (K[:2, 2] + 0.5) / joined - 0.5  # pixel centres are whole numbers
     return Camera(width // int(joined[0]), height // int(joined[1]), K, D, model)

@@ -42,6 +42,7 @@ def test_five_numbers_are_browns_lens_under_any_name(name: str) -> None:
 def test_zeros_are_no_distortion_whatever_the_name(name: str, count: int) -> None:
     camera = to_camera(info(name, [0.0] * count), rectified=False)
     assert camera.model == "plumb_bob" and not camera.distortion.any()
+    assert to_camera(info("rational_polynomial", [0.0] * 8), rectified=False).model == "rational_polynomial"
 
 
 def test_lenses_that_are_not_known_are_named() -> None:
