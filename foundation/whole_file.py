@@ -2,8 +2,9 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 
 
 @contextmanager
@@ -25,3 +26,25 @@ def write_whole(path: Path, content: bytes | str) -> None:
     """Write a file whole or not at all; text is written as UTF-8."""
     with whole_file(path) as part:
         part.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def check_folder(folder: Path) -> None:
+    """Raises `ValueError`, one line with the remedy, if no file can be written into a folder. Leaves nothing there.
+
+    To be asked before long work, whose results would have no place.
+    """
+    missing = [f for f in (folder, *folder.parents) if not f.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with NamedTemporaryFile(dir=folder):
+            pass
+    except NotADirectoryError:
+        raise ValueError(f"{folder} is a file, or in one; give a folder for the results") from None
+    except FileExistsError:
+        raise ValueError(f"{folder} is a file; give a folder for the results") from None
+    except OSError as error:
+        raise ValueError(f"{folder} cannot be written to ({error.strerror}); give another folder") from None
+    finally:
+        for f in missing:
+            with suppress(OSError):
+                f.rmdir()

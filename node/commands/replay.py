@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from foundation.whole_file import check_folder
 from node.commands.frame import read_frame, segments_of
 from node.commands.options import ReplayConfig
 from node.commands.progress import InferenceProgress
@@ -41,8 +42,7 @@ def replay(config: ReplayConfig, out: Console, err: Console) -> bool:
     `FileNotFoundError` in one line, before anything is written, for errors of the input.
     """
     begun = time.monotonic()
-    if config.folder.exists() and not config.folder.is_dir():
-        raise ValueError(f"{config.folder} is a file; give a folder for the results with --out")
+    check_folder(config.folder)
     prior = load_prior(config.prior)
     frame = read_frame(config, err)
     segments, source = segments_of(config, frame, err), config.source or SHIPPED_LOG

@@ -7,6 +7,7 @@ from pathlib import Path
 from rich.console import Console
 
 from calibration.camera_file import read_camera
+from foundation.whole_file import check_folder
 from node.commands.options import ReplayConfig
 from node.commands.progress import InferenceProgress
 from node.commands.replay import publish
@@ -29,6 +30,7 @@ def follow(config: ReplayConfig, out: Console, err: Console) -> bool:
     continued from an earlier frame continues from the repeat of that frame. Raises ValueError in one line, before
     anything is written, if there is no schedule, or if the prior or the configuration differs.
     """
+    check_folder(config.folder)
     path = config.source or SHIPPED_LOG
     camera = None if config.camera is None else read_camera(config.camera)
     playback = open_playback(config.source, 0.0, config.start_s, config.end_s, camera, config.topics)

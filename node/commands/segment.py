@@ -6,7 +6,7 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
-from foundation.whole_file import write_whole
+from foundation.whole_file import check_folder, write_whole
 from node.commands.frame import read_frame, segments_of
 from node.commands.options import Segmenting
 from node.figures.segments_picture import draw_segments
@@ -20,6 +20,7 @@ LARGEST_ID = 65535  # that a PNG of 16 bits holds
 
 def segment_frame(options: Segmenting, out: Console, err: Console) -> None:
     """Draw, number and list the objects of one frame, and write their label map. Raises as `segment`."""
+    check_folder(options.folder)
     frame = read_frame(options, err)
     found = segments_of(options, frame, err)
     largest = max(segment.id for segment in found)

@@ -23,7 +23,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from foundation.whole_file import write_whole
+from foundation.whole_file import check_folder, write_whole
 from node.commands.training_options import Training
 from node.figures.object_figure import draw_training
 from probnerf.likelihood.settings import Likelihood
@@ -47,6 +47,7 @@ def train(options: Training, out: Console, err: Console) -> bool:
     Raises ValueError if the folder holds another recipe, FloatingPointError if the loss is not finite.
     """
     preset, config, folder = PRESETS[options.preset], options.recipe, options.out
+    check_folder(folder)
     if options.data is not None:  # there is no phase that trains only the decoder
         config = replace(config, solid_steps=0, ray_learning_rate=config.learning_rate)
     if not 1 <= options.objects <= len(TRAIN_SEEDS):

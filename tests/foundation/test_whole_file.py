@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from foundation.one_line import one_line
-from foundation.whole_file import whole_file, write_whole
+from foundation.whole_file import check_folder, whole_file, write_whole
 
 
 def test_a_file_and_its_folder_appear(tmp_path: Path) -> None:
@@ -46,3 +46,20 @@ def test_a_reader_never_sees_half_of_a_file(tmp_path: Path) -> None:
 def test_an_error_is_one_line() -> None:
     assert one_line(ValueError("a\n  b\tc ")) == "a b c"
     assert one_line(TimeoutError()) == "TimeoutError"
+
+
+def test_a_folder_is_tried_and_left_as_it_was(tmp_path: Path) -> None:
+    check_folder(tmp_path / "new" / "deep")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "old").mkdir()
+    check_folder(tmp_path / "old")
+    assert not list((tmp_path / "old").iterdir())
+
+
+@pytest.mark.parametrize("name", ["file", "file/under", "full/of"])
+def test_a_place_that_holds_no_folder_is_named(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").write_text("x")
+    folder = Path("/proc/self/full/of") if name == "full/of" else tmp_path / name
+    with pytest.raises(ValueError, match=r"give a(nother)? folder") as caught:
+        check_folder(folder)
+    assert str(folder) in str(caught.value) and "\n" not in str(caught.value)

@@ -214,7 +214,7 @@ def test_a_bad_frame_folder_is_named(
         (["replay", "{table}", "--budget", "0"], "the budget is 0 s; give more than 0"),
         (["replay", "{table}", "--stages", "0"], "stages is 0; give 1 or more"),
         (["replay", "{table}", "--out", "{text}"], "notes.txt is a file; give a folder"),
-        (["replay", "{table}", "--out", "{text}/below"], "check this path, and that it may be read or written"),
+        (["replay", "{table}", "--out", "{text}/below"], "below is a file, or in one; give a folder"),
         (["replay", "{table}", "--prior", "{text}"], "notes.txt is not a readable prior"),
         (["replay", "{table}", "--prior", "{other}"], "needs ["),
         (["replay", "{table}", "--prior", "none.safetensors"], "none.safetensors: no such prior"),
