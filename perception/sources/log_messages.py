@@ -23,6 +23,7 @@ _KINDS = tuple(f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage"
 _IMAGE, _COMPRESSED, INFO = _KINDS
 _TYPES = get_typestore(Stores.ROS2_HUMBLE)
 _TRIES = 300  # messages of a topic, as many as a driver sends while it starts
+_MOST_PARTS = 100
 _MAGIC = b"\x89MCAP0\r\n"
 
 
@@ -121,7 +122,7 @@ class _Lost:
         self.this_one = False
         self._path, self._notes = path, notes
         self._good: Counter[str] = Counter()
-        self._bad: dict[str, str] = {}
+        self._bad: dict[str, str] = {}  # why, by topic
 
     @contextmanager
     def counted(self, topic: str) -> Iterator[None]:
@@ -138,7 +139,7 @@ class _Lost:
                 self._notes.append(note)
 
     def refuse_all(self) -> None:
-        """Raises ValueError for a topic of which nothing can be read."""
+        """Raises ValueError for a topic of which nothing could be read."""
         for topic, why in self._bad.items():
             if topic not in self._good:
                 raise ValueError(why)
@@ -165,7 +166,8 @@ def _parts(folder: Path) -> tuple[list[Path], list[str]]:
     ((name, parts),) = found.items()
     parts.sort()
     numbers = {number for number, _ in parts}
-    missing = sorted(set(range(max(numbers) + 1)) - numbers) if len(parts) > 1 or 0 not in numbers else []
+    most = max(numbers) if len(parts) > 1 or max(numbers) < _MOST_PARTS else 0  # a lone number may be a date
+    missing = sorted(set(range(min(most, _MOST_PARTS) + 1)) - numbers)
     told = ", ".join(f"{name}_{n}" for n in missing[:5]) + (", ..." if len(missing) > 5 else "")
     return [p for _, p in parts], [f"{folder.name}: parts are missing ({told})"] if missing else []
 
