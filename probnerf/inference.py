@@ -1,7 +1,7 @@
 """From an Observation to a Posterior: the model, the pixel likelihood and a sampler (unit cube only)."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -24,26 +24,15 @@ from probnerf.sampling.modes import mixture_of_modes
 from probnerf.sampling.populations import from_draws, start_from
 from probnerf.sampling.tempered_smc import tempered_smc
 from probnerf.settings import InferConfig, TemperedSMCConfig
-from probnerf.types import KINDS, Observation, Posterior, on_device
+from probnerf.types import Observation, Posterior
 
 _log_likelihood = program()(log_likelihood)
 
 
-def further_wall_error(config: InferConfig, model: Model, kinds: Mapping[str, float]) -> float:
-    """What the walls of a thing err by beside `config.wall_sigma`: a standard deviation, cube units.
-
-    The preset's `wall_sigma` is that of things which vary more than any prior learnt, and counts with the probability
-    that this is one: not a vessel, whose family is learnt whole. Without probabilities of `kinds`, it counts whole.
-    """
+def suited(config: InferConfig, model: Model) -> InferConfig:
+    """The settings with at least the wall error that the model's preset has."""
     least = model.preset.wall_sigma if isinstance(model, ProbNeRF) else 0.0
-    return math.sqrt(max(least**2 - config.wall_sigma**2, 0.0) * (1.0 - kinds.get(KINDS[0], 0.0)))
-
-
-def with_wall_error(observation: Observation, sigma: float) -> Observation:
-    """The observation with a further error of each range, cube units. No program is compiled for another one."""
-    if sigma == 0.0:
-        return observation
-    return replace(observation, range_sigma=on_device(np.hypot(np.asarray(observation.range_sigma), sigma)))
+    return replace(config, wall_sigma=max(config.wall_sigma, least))
 
 
 def likelihood_settings(config: InferConfig, sample_pose: bool = True) -> Likelihood:

@@ -28,6 +28,7 @@ from perception.inference.run_plan import Findings, runs_wanted
 from perception.inference.settings import ControllerConfig, PublishConfig
 from perception.inference.view_sampler import ViewSampler
 from perception.observation.object_frame import ObjectFrame
+from probnerf.inference import suited
 from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.checkpoint import Prior
 from probnerf.sampling.hmc import StageInfo
@@ -75,7 +76,8 @@ class Inference:
     _seconds: float = 0.0
 
     def __post_init__(self) -> None:
-        self._sampler = ViewSampler(self.view, self.prior, self.config.infer, self.seed, self.limits, self.before)
+        infer = suited(self.config.infer, self.prior.model)
+        self._sampler = ViewSampler(self.view, self.prior, infer, self.seed, self.limits, self.before)
         self._publisher = _Publisher(self._sampler, self.config, self.callbacks)
 
     @property

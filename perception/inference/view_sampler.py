@@ -14,17 +14,7 @@ from perception.inference.limits import Limits
 from perception.inference.publish import ConditionedView
 from perception.inference.stopwatch import Stopwatch
 from perception.observation.encoder_crop import crop
-from probnerf.inference import (
-    asks_encoder,
-    crossings_of,
-    encoder_guess,
-    further_wall_error,
-    infer,
-    likelihood_of,
-    modes_of,
-    sampler_of,
-    with_wall_error,
-)
+from probnerf.inference import asks_encoder, crossings_of, encoder_guess, infer, likelihood_of, modes_of, sampler_of
 from probnerf.likelihood.settings import Likelihood
 from probnerf.network_start import defensive, network_guess, network_used, picture_density, weigh_draws
 from probnerf.prior.checkpoint import Prior
@@ -34,7 +24,7 @@ from probnerf.prior.posterior_network import EncoderPicture
 from probnerf.sampling.hmc import Reference, StageInfo
 from probnerf.sampling.importance import WeighedDraws
 from probnerf.settings import InferConfig, TemperedSMCConfig
-from probnerf.types import KINDS, Observation, Posterior, StopReason
+from probnerf.types import KINDS, Posterior, StopReason
 
 # Two batches of eigenvalues may wait for each other for ever: each holds a thread of XLA's pool, one per core, until
 _ONE_AT_A_TIME = RLock()  # another thread of that pool has done its parts (jaxlib's ParallelBatchMap)
@@ -61,14 +51,9 @@ class ViewSampler:
     _stage_s: list[float] = field(default_factory=list)  # s; each stage of the latest run
 
     @cached_property
-    def observation(self) -> Observation:
-        """What sampling is conditioned on: the view's, with what the walls of such a thing err by."""
-        return with_wall_error(self.view.observation, further_wall_error(self.config, self.prior.model, self.kinds))
-
-    @cached_property
     def likelihood(self) -> Likelihood:
         """Of the view."""
-        return likelihood_of(self.config, self.observation, not self.view.pose_known)
+        return likelihood_of(self.config, self.view.observation, not self.view.pose_known)
 
     @property
     def smc(self) -> TemperedSMCConfig:
@@ -142,7 +127,7 @@ class ViewSampler:
                 return network_guess(key, self._density, self.config.network.guess)
         assert isinstance(self.prior.model, ProbNeRF) and self._picture is not None
         with self.stopwatch.part("climbing"):
-            return encoder_guess(key, self.prior.model, self.likelihood, self.observation, self._picture)
+            return encoder_guess(key, self.prior.model, self.likelihood, self.view.observation, self._picture)
 
     def weigh(self) -> WeighedDraws | None:
         """Have all runs begin at the network's draws, and weigh some of these. None if none may be weighed.
@@ -156,12 +141,12 @@ class ViewSampler:
             return None
         with self.stopwatch.part("network"):
             return weigh_draws(
-                key, self.prior, self.likelihood, self.observation, mixture, settings, self.limits.deadline
+                key, self.prior, self.likelihood, self.view.observation, mixture, settings, self.limits.deadline
             )
 
     def climb(self) -> None:
         """Have all runs begin at the modes that the encoder's guesses climb to."""
-        model, observation, key = self.prior.model, self.observation, jax.random.fold_in(self._key, 1)
+        model, observation, key = self.prior.model, self.view.observation, jax.random.fold_in(self._key, 1)
         with _ONE_AT_A_TIME, self.stopwatch.part("climbing"):
             self._reference = jax.block_until_ready(modes_of(key, model, observation, self.config, self._picture))
         climbed = self.config.modes.gradients(self.likelihood.dim(model))
@@ -205,7 +190,7 @@ class ViewSampler:
             posterior, _ = infer(
                 jax.random.fold_in(self._key, 10 + number) if number else self._key,
                 self.prior.model,
-                self.observation,
+                self.view.observation,
                 self.config,
                 reference=self._reference,
                 before=self.before,
@@ -215,7 +200,7 @@ class ViewSampler:
                 stages=stages,
             )
         self.stages += int(posterior.diagnostics.stages)
-        crossings = crossings_of(self.likelihood, self.observation)
+        crossings = crossings_of(self.likelihood, self.view.observation)
         self.point_gradients += float(posterior.diagnostics.point_gradients) * crossings
         return posterior
 

@@ -13,7 +13,7 @@ from perception.sources.frame import Frame
 from perception.sources.recording import Log
 from perception.sources.settings import SHIPPED_LOG
 from probnerf.compile_cache import rehearsal
-from probnerf.inference import infer
+from probnerf.inference import infer, suited
 from probnerf.network_start import network_used
 from probnerf.pixel_status import FREE, UNKNOWN
 from probnerf.types import Posterior, StopReason
@@ -62,7 +62,7 @@ def _infer_twice(trial: Tracker, look: Look, frame: Frame, hidden: Segment) -> N
 def _sampled(trial: Tracker, look: Look, before: Posterior | None) -> Posterior:
     """One stage, from an answer that was cut short or from the prior."""
     observation = look._view.observation
-    key, config = jax.random.key(0), trial.config.infer
+    key, config = jax.random.key(0), suited(trial.config.infer, trial.prior.model)
     posterior, _ = infer(key, trial.prior.model, observation, config, before=before, stages=1)
     if posterior.result == StopReason.INTERRUPTED:
         raise KeyboardInterrupt

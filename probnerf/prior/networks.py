@@ -39,9 +39,7 @@ class Preset:
     smooth: bool = False  # SiLU in the hypernetwork instead of the paper's ReLU
     pairs: int = 2  # of couplings in the flow
     explains: float = 1.0  # share of a view's pixels that its models explain of 95% of what they should know
-    wall_sigma: float = (
-        0.0  # cube units: at least, of things that vary more than the prior learnt (`further_wall_error`)
-    )
+    wall_sigma: float = 0.0  # cube units: the least `InferConfig.wall_sigma` with such a model
 
     @property
     def field(self) -> MLPField:
