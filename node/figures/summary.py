@@ -62,7 +62,7 @@ def _doubt(part: Undecided | None) -> str:
         return "no part of it"
     places = {"front": "in front", "left": "on the left", "back": "behind", "right": "on the right"}
     where = "in its middle" if part.side is None else places[part.side]
-    return f"{CM3 * part.volume_m3:.0f} cm³ {where}, 25 to 75% likely"
+    return f"{CM3 * part.volume_m3:.0f} cm³ {where} (25 to 75%)"
 
 
 def diagnostics(h: Hypotheses) -> dict[str, str]:

@@ -122,7 +122,7 @@ def test_the_short_table_tells_the_unseen(mug: Hypotheses) -> None:
     assert 0 < low <= middle <= high < space
     rows = {**figures(mug), **diagnostics(mug)}
     assert rows["log evidence"] == "-321.5 ± 0.5 nats" and rows["stopped"] == "converged, stage 7"
-    assert "cm³" in rows["undecided"] and "25 to 75% likely" in rows["undecided"]
+    assert "cm³" in rows["undecided"] and "(25 to 75%)" in rows["undecided"]
     assert rows["hypotheses"].startswith("4 (2.7") and "cm³" in rows["solid in it"]
     assert diagnostics(replace(mug, diagnostics=AnswerDiagnostics()))["log evidence"] == "none"
 
