@@ -30,7 +30,8 @@ _NOT_READ = (
     "foxglove_msgs/msg/RawImage",
     "foxglove_msgs/msg/CompressedImage",
 )
-_WAITING = 150  # colour images that may wait for depth which is recorded late
+# Colour images that may wait for depth which is recorded late: so many, or what fills so many bytes, but some always.
+_WAITING, _WAITING_BYTES, _WAITING_LEAST = 150, 1 << 28, 30
 
 
 class Log:
@@ -175,7 +176,8 @@ class Log:
     def _matches(self) -> Iterator[Match[tuple[Received, Camera], Received]]:
         """Every colour image with its camera and, by topic, the partner nearest in stamp."""
         streams = [topic for topic in (self.depth_topic, self.label_topic, self._pose_topic) if topic]
-        matcher: StampMatcher[tuple[Received, Camera], Received] = StampMatcher(streams, self.tolerance_ns, _WAITING)
+        waiting = max(_WAITING_LEAST, min(_WAITING, _WAITING_BYTES // max(len(self._colour.data), 1)))
+        matcher: StampMatcher[tuple[Received, Camera], Received] = StampMatcher(streams, self.tolerance_ns, waiting)
         camera = self._first_camera
         for received in self._read({self.colour_topic, *filter(None, [self.info_topic]), *streams}):
             received = replace(received, by_log_time=self._by_log_time)
