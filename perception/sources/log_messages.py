@@ -19,8 +19,8 @@ from foundation.one_line import one_line
 from perception.sources.ros_camera import to_camera
 from perception.sources.ros_images import samples, stamp_ns
 
-_KINDS = tuple(f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
-_IMAGE, _COMPRESSED, INFO = _KINDS
+INFO = "sensor_msgs/msg/CameraInfo"
+_KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", INFO)
 _TYPES = get_typestore(Stores.ROS2_HUMBLE)
 _TRIES = 300  # messages of a topic, as many as a driver sends while it starts
 _MOST_PARTS = 100

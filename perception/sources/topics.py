@@ -72,9 +72,8 @@ def colour_topic(path: Path, firsts: Mapping[str, Any], name: str | None = None)
 
     `name` is the requested topic.
     """
-    found = [
-        t for t, m in firsts.items() if encoding_of(m) in COLOURS and (t == name or _is_picture(t, encoding_of(m)))
-    ]
+    encodings = {t: encoding_of(message) for t, message in firsts.items()}
+    found = [t for t, e in encodings.items() if e in COLOURS and (t == name or _is_picture(t, e))]
     if not found or (name is not None and name not in found):
         seen = ", ".join(f"{t} ({encoding_of(message)})" for t, message in firsts.items()) or "none"
         what = "no colour image" if name is None else f"no colour image on {name}"
