@@ -1,12 +1,14 @@
 """Shapes to learn from, made of meshes: a folder of any, or the household generator's."""
 
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import trimesh
+from jaxtyping import Float
 
 from probnerf.objects.free_form import bent
 from probnerf.objects.household import draw_mesh
@@ -20,6 +22,7 @@ from probnerf.training.shape_set import (
     GRID,
     NEAR,
     OFFSET,
+    PAINT_NUMBERS,
     SURFACE,
     TABLETOP_NUMBERS,
     ShapeSet,
@@ -116,8 +119,21 @@ def paint_of(seed: int, index: int) -> Paint:
     return draw_paint(np.random.default_rng([seed, 53, index]))
 
 
-def sample_mesh(thing: MeshObject, seed: int, paints: int = PAINTS) -> ShapeSet:
-    """A set of one object (placed already), with paints drawn from the seed."""
+class Painted(Protocol):
+    """How an object is painted, and what recognition reads of it."""
+
+    def rgb(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Lit colours in [0, 1] of surface points (cube units) with unit normals."""
+        ...
+
+    @property
+    def description(self) -> Float[np.ndarray, "p"]:
+        """At most PAINT_NUMBERS numbers of order 1."""
+        ...
+
+
+def sample_mesh(thing: MeshObject, seed: int, paints: Sequence[Painted] | int = PAINTS) -> ShapeSet:
+    """A set of one object (placed already) with these paints, or with so many that are drawn from the seed."""
     rng = np.random.default_rng([seed, 41])
     surface, normal = thing.surface(rng, SURFACE + NEAR)
     width = np.exp(rng.uniform(np.log(OFFSET[0]), np.log(OFFSET[1]), (NEAR, 1)))
@@ -126,7 +142,7 @@ def sample_mesh(thing: MeshObject, seed: int, paints: int = PAINTS) -> ShapeSet:
     points = as_units(np.concatenate([near, rng.uniform(-1.0, 1.0, (ANYWHERE, 3))]))
     grid = centres(GRID)
     distance = thing.signed_distance(np.concatenate([grid, in_cube(points)]))
-    drawn = [paint_of(seed, i) for i in range(paints)]
+    drawn = [paint_of(seed, i) for i in range(paints)] if isinstance(paints, int) else paints
     rgb = np.stack([paint.rgb(surface, normal) for paint in drawn])
     return ShapeSet(
         distance=np.clip(distance[: len(grid)], -CLIP, CLIP).astype(np.float16)[None],
@@ -142,5 +158,7 @@ def sample_mesh(thing: MeshObject, seed: int, paints: int = PAINTS) -> ShapeSet:
     )
 
 
-def _appearance(paint: Paint) -> np.ndarray:
-    return np.concatenate([paint.description, np.zeros(TABLETOP_NUMBERS)]).astype(np.float16)
+def _appearance(paint: Painted) -> np.ndarray:
+    numbers = np.zeros(PAINT_NUMBERS + TABLETOP_NUMBERS, np.float16)
+    numbers[: len(paint.description)] = paint.description
+    return numbers
