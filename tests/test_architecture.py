@@ -56,6 +56,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("harness",),
         ("scenes",),
         ("measures",),
+        ("paper",),
         ("rivals",),
         ("studies",),
         ("figures", "golden"),

@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from benchmarks.paper.bodies import draw_person
 from benchmarks.paper.cars import draw_car
 from perception.simulation.ray_caster import RayCaster
 from probnerf.geometry import look_at, pinhole_rays
@@ -71,7 +72,8 @@ class Family:
 
 
 CARS = Family("cars", draw_car, distance=1.7, middle=(0.0, 0.0, BASE_Z + 0.25), elevation=(-5.0, 85.0))
-FAMILIES = {family.name: family for family in (CARS,)}
+BODIES = Family("bodies", draw_person, distance=2.0, middle=(0.0, 0.0, BASE_Z + 0.7), elevation=(0.0, 0.0))
+FAMILIES = {family.name: family for family in (CARS, BODIES)}
 
 
 @dataclass(frozen=True, eq=False)

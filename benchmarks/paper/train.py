@@ -26,7 +26,7 @@ from probnerf.training.shape_set import load_shapes
 class Options:
     """Train a prior of one family."""
 
-    family: Literal["cars"] = "cars"
+    family: Literal["cars", "bodies"] = "cars"
     """What it learns."""
     out: Path = Path("runs/paper-cars")
     """Folder of the run."""
