@@ -53,9 +53,14 @@ def _half(seed: int) -> VesselPicture | None:
     return half_hidden(seed, next(carton_seeds(range(seed + 1, seed + 1000))))
 
 
-def _no_handle_in_sight(seed: int) -> VesselPicture | None:
+def unseen_handle(seed: int) -> PlacedObject | None:
+    """The cup, mug or pitcher of a seed as `any_view` sees it, if a small picture shows no handle."""
     placed, T = _stand(seed)
-    if placed.shape.kind not in (CUP, MUG, PITCHER) or shows_handle(placed, T):  # a small picture costs less
+    return None if placed.shape.kind not in (CUP, MUG, PITCHER) or shows_handle(placed, T) else placed
+
+
+def _no_handle_in_sight(seed: int) -> VesselPicture | None:
+    if unseen_handle(seed) is None:
         return None
     picture = any_view(seed)
     return None if pixels_of_handle(picture) else picture

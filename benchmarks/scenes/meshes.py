@@ -80,7 +80,8 @@ def mesh_view(path: Path, seed: int, config: ViewConfig | None = None) -> Vessel
         cube=cube,
         shape=None,
         T_canonical_view=np.eye(4),
-        solid=coarsen(enclosed(in_cube, FINE), GRID),
+        solid=(there := coarsen(enclosed(in_cube, FINE), GRID)),
+        body=there,
         seen=seen_voxels(faultless, found, cube, GRID) | in_table(GRID),
         near_handle=np.zeros((GRID,) * 3, bool),
     )

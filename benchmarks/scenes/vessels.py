@@ -82,6 +82,7 @@ class VesselView:
     shape: TabletopObject | None  # None: none of the family
     T_canonical_view: Float[np.ndarray, "4 4"]  # affine: from the view's cube to the shape's, cube units both
     solid: Bool[np.ndarray, "32 32 32"]
+    body: Bool[np.ndarray, "32 32 32"]  # without its handle
     seen: Bool[np.ndarray, "32 32 32"]  # by the true geometry (without depth, in silhouette), or in the table
     near_handle: Bool[
         np.ndarray, "32 32 32"
@@ -151,6 +152,7 @@ def vessel_view(
         shape=placed.shape,
         T_canonical_view=T_canonical_view,
         solid=coarsen(solid((body | handle).astype(np.float32)), GRID),
+        body=coarsen(solid(body.astype(np.float32)), GRID),
         seen=seen_voxels(faultless, found, cube, GRID) | in_table(GRID),
         near_handle=swept & ~coarsen(body, GRID),
         pose_known=pose_known,
