@@ -106,7 +106,7 @@ class Person:
         """The parameters of appearance as numbers of order 1. The pose is in the shape."""
         flags = [2.0 * self.shorts, 2.0 * self.long_hair, *2.0 * np.eye(3)[self.sleeves]]
         parts = [2.0 * self.colours - 1.0, self.light, self.ambient, self.lamp, flags]
-        return np.concatenate([np.ravel(part) for part in parts]).astype(np.float32)
+        return np.concatenate([np.ravel(np.asarray(part, np.float32)) for part in parts])
 
 
 def _hinge(bone: str, onto: str, angle: float) -> Float[np.ndarray, "3"]:
