@@ -49,7 +49,7 @@ def test_a_block_beside_a_can_counts_by_its_reach_where_nobody_saw() -> None:
     assert reach(shapes, can, np.zeros_like(can)).tolist() == [0.0, 5.0, 5.0, 0.0]
     assert reach(shapes, can, x > 0).tolist() == [0.0, 0.0, 5.0, 0.0]
     view = SimpleNamespace(body=can, seen=x > 0)
-    assert has_handle(view, shapes).tolist() == [False, False, True, False]  # type: ignore[arg-type]
+    assert has_handle(view, shapes).tolist() == [False, False, True, False]
 
 
 def test_the_base_rate_is_the_share_of_unseen_handles() -> None:

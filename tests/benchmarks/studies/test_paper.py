@@ -13,7 +13,7 @@ import pytest
 from benchmarks.paper.conditioned import HELD_OUT, OBJECT_RAYS, PLACES, SIZE, Conditioned, base_rate, rays_of
 from benchmarks.paper.families import BODIES, CARS
 from benchmarks.paper.judged import judge, pictures, shapes
-from benchmarks.paper.methods import FIXED, HMC, HMC_DELTA, PRIOR, VI_DELTA, Effort, Found, Question
+from benchmarks.paper.methods import FIXED, HMC, HMC_DELTA, PRIOR, VI_DELTA, Effort, Found, Method, Question
 from benchmarks.rivals.methods import weighted_posterior
 from benchmarks.studies import paper
 from benchmarks.studies.paper import ANNEALING, Options, main, rear_seeds
@@ -123,9 +123,16 @@ def test_rows_are_kept_and_summed_up(tmp_path: Path, model: ProbNeRF, monkeypatc
     monkeypatch.setattr(paper, "base_rate", lambda *_: None)
     tints = np.linspace(0.0, 1.0, 8)[:, None, None, None, None]
     monkeypatch.setattr(paper, "pictures", lambda *_: np.broadcast_to(tints, (8, 1, SIZE, SIZE, 3)))
-    asked = []
-    methods = tuple(replace(m, answer=lambda q, m=m: asked.append(m.name) or m.answer(q)) for m in (HMC, PRIOR))
-    monkeypatch.setattr(paper, "METHODS", methods)
+    asked: list[str] = []
+
+    def noted(method: Method) -> Method:
+        def answer(question: Question) -> Found:
+            asked.append(method.name)
+            return method.answer(question)
+
+        return replace(method, answer=answer)
+
+    monkeypatch.setattr(paper, "METHODS", (noted(HMC), noted(PRIOR)))
     options = {"quick": True, "families": "cars;bodies", "results": tmp_path / "kept.jsonl"}
     found = main(Options(tmp_path, **options))
     assert asked == ["hmc", "the prior alone"] * 2
