@@ -2,19 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
 from calibration.camera import Camera
-from foundation.one_line import one_line
-
-Model = Literal["plumb_bob", "rational_polynomial", "equidistant"]
-_COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
-# No corner detector is more accurate. It keeps a fit without residuals from reporting zero uncertainty.
-_LEAST_NOISE_PX = 0.01
+from calibration.fit import Bend, BoardView, FittedView, Model, fit
 
 
 @dataclass(frozen=True)
@@ -32,33 +25,12 @@ class CalibrateConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class BoardView:
-    """Corners of a board in one picture."""
-
-    name: str
-    points: Float[np.ndarray, "n 3"]  # m, board frame, z = 0
-    pixels: Float[np.ndarray, "n 2"]
-
-
-@dataclass(frozen=True, eq=False)
-class FittedView:
-    """A view with the pose that the calibration gives it."""
-
-    view: BoardView
-    T_camera_board: Float[np.ndarray, "4 4"]
-    residuals: Float[np.ndarray, "n 2"]  # px, found less predicted
-
-    @property
-    def rms(self) -> float:
-        """px, root of the mean squared distance."""
-        return float(np.sqrt((self.residuals**2).sum(axis=1).mean()))
-
-
-@dataclass(frozen=True, eq=False)
 class Calibration:
     """A camera, the views used for it, and the views left out with the reason."""
 
     camera: Camera  # with K_std, distortion_std and rms
+    covariance: Float[np.ndarray, "p p"]  # of (fx, fy, cx, cy, distortion)
+    bend: Bend  # of the board
     views: tuple[FittedView, ...]
     dropped: tuple[tuple[str, str], ...]  # name, why
     trouble: str | None  # why this calibration must not be used, and what to do
@@ -101,10 +73,10 @@ def calibrate(
 ) -> Calibration:
     """The camera of pictures of `size` (width, height; px) that saw these views of one board.
 
-    Least squares over the intrinsics and the board's poses (Zhang 2000; OpenCV). Views that fit badly are left out one
-    by one, the worst first, though never more than half. Standard deviations are those of least squares at the
-    solution, for independent noise of the corners as large as the residuals. Reasons not to use the
-    result are in `trouble`.
+    Least squares over the intrinsics, the board's poses and its bend (`calibration.fit`). Views that fit badly are left
+    out one by one, the worst first, though never more than half. Standard deviations are by how the views disagree
+    (`calibration.deviations`), as errors within one picture are not independent. Reasons not to use the result are in
+    `trouble`.
     Raises ValueError if the views are too few or no camera fits at all.
     """
     config = config or CalibrateConfig()
@@ -115,99 +87,16 @@ def calibrate(
         )
     kept, dropped = list(views), []
     while True:
-        camera, fitted = _fit(kept, size, model)
-        errors = np.array([f.rms for f in fitted])
+        found = fit(kept, size, model)
+        errors = np.array([f.rms for f in found.views])
         worst, limit = int(errors.argmax()), max(config.outlier * float(np.median(errors)), config.outlier_px)
         if errors[worst] <= limit or 2 * (len(kept) - 1) < len(views) or len(kept) <= config.fewest_views:
             break
         times = errors[worst] / np.median(errors)
         why = f"its error is {errors[worst]:.2f} px, {times:.0f} times the median: blurred, bent, or corners mistaken?"
         dropped.append((kept.pop(worst).name, why))
-    return Calibration(camera, fitted, tuple(dropped), _trouble(camera, fitted, config))
-
-
-def _fit(views: Sequence[BoardView], size: tuple[int, int], model: Model) -> tuple[Camera, tuple[FittedView, ...]]:
-    points, pixels = [v.points for v in views], [v.pixels for v in views]
-    K: Any
-    D: Any
-    try:
-        if model == "equidistant":
-            K, D, rvecs, tvecs = _fit_fisheye(points, pixels, size)
-        else:
-            flags = cv2.CALIB_RATIONAL_MODEL if model == "rational_polynomial" else 0
-            _, K, D, rvecs, tvecs, *_ = cv2.calibrateCameraExtended(
-                [p.astype(np.float32) for p in points],
-                [p.astype(np.float32).reshape(-1, 1, 2) for p in pixels],
-                size,
-                np.eye(3),
-                np.zeros(5),
-                flags=flags,
-            )
-        D = np.ravel(D)[: _COEFFICIENTS[model]]
-        camera = Camera(size[0], size[1], K, D, model)
-    except (cv2.error, ValueError) as error:
-        what = getattr(error, "err", "") or one_line(error)
-        raise ValueError(
-            f"no {model} camera fits these {len(views)} views ({what}); take views with the board tilted by 30 degrees"
-            " or more, or try another model"
-        ) from None
-    fitted, residuals, jacobians = [], [], []
-    for view, rvec, tvec in zip(views, rvecs, tvecs, strict=True):
-        rvec, tvec = np.reshape(rvec, 3), np.reshape(tvec, 3)
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(rvec)[0], tvec
-        predicted, inner, outer = camera.project_posed(view.points, rvec, tvec)
-        fitted.append(FittedView(view, T, view.pixels - predicted))
-        residuals.append((view.pixels - predicted).ravel())
-        jacobians.append((inner, outer))
-    rss = float((np.concatenate(residuals) ** 2).sum())
-    count = sum(len(r) for r in residuals)
-    free = max(count - 4 - len(D) - 6 * len(views), 1)
-    std = _deviations(jacobians) * max(np.sqrt(rss / free), _LEAST_NOISE_PX)
-    K_std = np.array([[std[0], 0.0, std[2]], [0.0, std[1], std[3]], [0.0, 0.0, 0.0]])
-    rms = float(np.sqrt(rss / (count / 2)))
-    return Camera(size[0], size[1], K, D, model, K_std, std[4:], rms), tuple(fitted)
-
-
-def _fit_fisheye(points: list[np.ndarray], pixels: list[np.ndarray], size: tuple[int, int]) -> tuple[Any, ...]:
-    """K, distortion, rvecs and tvecs, the best of several starts: OpenCV fails from one that puts corners past 90 deg.
-
-    Raises cv2.error where no start succeeds.
-    """
-    # The flags are cv2.fisheye's in OpenCV 4 and cv2's, with other values, in 5. No skew: it is no lens's.
-    names = ("CALIB_RECOMPUTE_EXTRINSIC", "CALIB_FIX_SKEW", "CALIB_USE_INTRINSIC_GUESS")
-    flags = sum(getattr(cv2.fisheye, name, None) or getattr(cv2, name) for name in names)
-    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-9)
-    fits, complaint = [], cv2.error("no start")
-    for across in (180.0, 130.0, 90.0):  # degrees over the picture's longer side
-        f = max(size) / np.radians(across)
-        K = np.array([[f, 0.0, (size[0] - 1) / 2], [0.0, f, (size[1] - 1) / 2], [0.0, 0.0, 1.0]])
-        shaped = [p.reshape(1, -1, 3) for p in points], [p.reshape(1, -1, 2) for p in pixels]
-        try:
-            fits.append(cv2.fisheye.calibrate(*shaped, size, K, np.zeros(4), flags=flags, criteria=criteria))
-        except cv2.error as error:
-            complaint = error
-    if not fits:
-        raise complaint
-    return min(fits, key=lambda fit: fit[0])[1:]
-
-
-def _deviations(
-    jacobians: Sequence[tuple[Float[np.ndarray, "m p"], Float[np.ndarray, "m 6"]]],
-) -> Float[np.ndarray, "p"]:
-    """Standard deviations of the intrinsics for noise of 1 px: the root of the diagonal of (J^T J)^-1, poses marginal.
-
-    Each view's derivatives by the intrinsics are reduced to what its own pose cannot imitate. OpenCV inverts the whole
-    by a pseudo-inverse, which gives 0 for a parameter that is not determined; here it is very large.
-    """
-    reduced = []
-    for inner, outer in jacobians:
-        basis = np.linalg.qr(outer / np.maximum(np.linalg.norm(outer, axis=0), 1e-300))[0]
-        reduced.append(inner - basis @ (basis.T @ inner))
-    J = np.concatenate(reduced)
-    scale = np.maximum(np.linalg.norm(np.concatenate([inner for inner, _ in jacobians]), axis=0), 1e-300)
-    _, s, Vt = np.linalg.svd(J / scale, full_matrices=False)
-    return np.sqrt(((Vt / np.maximum(s, 1e-12)[:, None]) ** 2).sum(axis=0)) / scale
+    trouble = _trouble(found.camera, found.views, config)
+    return Calibration(found.camera, found.covariance, found.bend, found.views, tuple(dropped), trouble)
 
 
 def tilts(views: Sequence[FittedView]) -> Float[np.ndarray, "v 2"]:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from calibration.calibrate import FittedView, tilts
+from calibration.calibrate import tilts
+from calibration.fit import FittedView
 
 GRID = (8, 6)  # cells over the picture's width and height
 _TILT = 15.0  # degrees; a lean that counts

@@ -10,10 +10,11 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 
 from calibration.boards import DEFAULT_BOARD, Board, parse_board
-from calibration.calibrate import BoardView, CalibrateConfig, Calibration, calibrate, distinct, motion
+from calibration.calibrate import CalibrateConfig, Calibration, calibrate, distinct, motion
 from calibration.camera import Camera
 from calibration.camera_file import read_camera, write_camera
 from calibration.coverage import Coverage, coverage, next_views
+from calibration.fit import BoardView
 from calibration.print_board import Paper, write_target
 from node.commands.options import Calibrate
 from node.figures.calibration_figure import draw_calibration

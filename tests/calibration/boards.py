@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from calibration.boards import Board, parse_board
-from calibration.calibrate import BoardView
 from calibration.camera import Camera
+from calibration.fit import BoardView
 
 K = np.array([[430.0, 0.0, 310.0], [0.0, 432.0, 221.0], [0.0, 0.0, 1.0]])
 WIDE = np.array([[258.0, 0.0, 310.0], [0.0, 259.0, 221.0], [0.0, 0.0, 1.0]])

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from calibration.boards import parse_board
-from calibration.calibrate import BoardView, CalibrateConfig, calibrate, distinct
-from tests.calibration.boards import CAMERAS, SIZE, views
+from calibration.calibrate import CalibrateConfig, calibrate, distinct
+from calibration.fit import BoardView
+from tests.calibration.boards import CAMERAS, CHESSBOARD, SIZE, poses, views
 
 CONFIG = CalibrateConfig()
 PARTS = ([0, 1, 0, 1], [0, 1, 2, 2])  # fx, fy, cx, cy
@@ -33,7 +34,7 @@ def test_a_known_camera_is_recovered(model: str) -> None:
     # Poses and residuals belong to it.
     for fitted in result.views:
         T = fitted.T_camera_board
-        predicted = found.project(fitted.view.points @ T[:3, :3].T + T[:3, 3])
+        predicted = found.project(result.bend.bent(fitted.view.points) @ T[:3, :3].T + T[:3, 3])
         np.testing.assert_allclose(fitted.view.pixels - predicted, fitted.residuals, atol=1e-6)
         assert fitted.rms == pytest.approx(np.sqrt((fitted.residuals**2).sum(axis=1).mean()))
 
@@ -45,13 +46,44 @@ def test_exact_corners_give_the_exact_camera(model: str) -> None:
     assert camera.rms < 1e-2
 
 
-def test_deviations_are_opencvs() -> None:
-    seen = views("plumb_bob", noise=0.3)
+def test_deviations_are_opencvs_where_errors_are_independent() -> None:
+    """Not less, and not much more: the bend is fitted besides, and its prior does not tell all."""
+    seen = views("plumb_bob", count=40, noise=0.3)
     camera = calibrate(seen, SIZE).camera
     points, pixels = ([getattr(v, name).astype(np.float32) for v in seen] for name in ("points", "pixels"))
     theirs = cv2.calibrateCameraExtended(points, pixels, SIZE, np.eye(3), np.zeros(5))[5].ravel()
-    np.testing.assert_allclose(camera.K_std[PARTS], theirs[:4], rtol=1e-3)
-    np.testing.assert_allclose(camera.distortion_std, theirs[4:9], rtol=1e-3)
+    ratio = np.array([*camera.K_std[PARTS], *camera.distortion_std]) / theirs[:9]
+    assert (ratio > 0.98).all() and (ratio < 2.0).all() and np.median(ratio) < 1.5
+
+
+def test_errors_that_a_picture_has_in_common_count_once() -> None:
+    """Each picture's corners are scaled about their middle: as many errors as pictures, not as corners."""
+    rng = np.random.default_rng(0)
+    independent, common = views("plumb_bob", count=20, noise=0.3), []
+    for view in views("plumb_bob", count=20, noise=0.02):
+        about = view.pixels - view.pixels.mean(axis=0)
+        common.append(replace(view, pixels=view.pixels + about @ rng.normal(size=(2, 2)) * 0.004))
+    alone, together = (calibrate(v, SIZE).camera for v in (independent, common))
+    assert together.K_std[0, 0] / together.rms > 3 * alone.K_std[0, 0] / alone.rms
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
+def test_a_bent_board_is_found_bent(model: str) -> None:
+    """A bow of 1% of the half board moves the focal length of a flat fit by far more than the noise."""
+    rng = np.random.default_rng(1)
+    corners = CHESSBOARD.corners
+    x = (corners[:, 0] - corners[:, 0].mean()) / np.ptp(corners[:, 0]) * 2
+    bow = corners + (0.01 * np.ptp(corners[:, 0]) / 2 * x**2)[:, None] * [0, 0, 1]
+    seen = []
+    for i, T in enumerate(poses(CAMERAS[model], CHESSBOARD, 15, 40.0, 3)):
+        pixels = CAMERAS[model].project(bow @ T[:3, :3].T + T[:3, 3])
+        seen.append(BoardView(str(i), corners, pixels + 0.05 * rng.normal(size=pixels.shape)))
+    result = calibrate(seen, SIZE, model)
+    np.testing.assert_allclose(result.bend.coefficients, [0.01, 0, 0], atol=5e-4)
+    np.testing.assert_allclose(np.ptp(result.bend.bent(corners)[:, 2]), np.ptp(bow[:, 2]), rtol=0.05)
+    assert result.camera.rms < 0.08
+    assert (np.abs(result.camera.K - CAMERAS[model].K)[PARTS] < 4 * result.camera.K_std[PARTS]).all()
+    assert (result.camera.K_std[PARTS] < 1.0).all()
 
 
 def test_a_fisheyes_deviations_are_its_spread_over_repetitions() -> None:
@@ -64,7 +96,8 @@ def test_a_fisheyes_deviations_are_its_spread_over_repetitions() -> None:
         found.append([*camera.K[PARTS], *camera.distortion])
         stated.append([*camera.K_std[PARTS], *camera.distortion_std])
     ratio = np.std(found, axis=0, ddof=1) / np.mean(stated, axis=0)
-    assert (ratio > 0.55).all() and (ratio < 1.5).all()  # 3 standard deviations of 24 repetitions
+    # 3 standard deviations of 24 repetitions; with 8 views the jackknife errs on the wide side
+    assert (ratio > 0.4).all() and (ratio < 1.5).all()
 
 
 @pytest.mark.parametrize("model", CAMERAS)

@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.calibrate import BoardView, FittedView, calibrate, tilts
+from calibration.calibrate import calibrate, tilts
 from calibration.coverage import coverage, next_views
+from calibration.fit import BoardView, FittedView
 from tests.calibration.boards import CAMERAS, CHESSBOARD, SIZE, views
 
 
