@@ -8,6 +8,7 @@ import numpy as np
 import yaml
 
 from calibration.camera import Camera
+from calibration.projection import Projection
 from foundation.bounded import check_size
 from foundation.one_line import one_line
 from foundation.whole_file import write_whole
@@ -16,11 +17,11 @@ from foundation.whole_file import write_whole
 _OURS = "farside_calibration"
 
 
-def write_camera(path: Path, camera: Camera, name: str = "camera") -> None:
+def write_camera(path: Path, camera: Camera, name: str = "camera", misses: Projection | None = None) -> None:
     """Write a camera to YAML atomically; `read_camera` returns it exactly.
 
     Keys are those of ROS's camera_calibration_parsers. The standard deviations and the RMS (px) are under a key of our
-    own.
+    own, and so is what `misses` says of the picture, row by row from its upper edge to its lower (`projection.GRID`).
     """
     distortion = camera.distortion
     content: dict[str, Any] = {
@@ -40,6 +41,10 @@ def write_camera(path: Path, camera: Camera, name: str = "camera") -> None:
         ours["camera_matrix_std"] = _matrix(camera.K_std)
     if camera.distortion_std is not None:
         ours["distortion_std"] = _matrix(camera.distortion_std[None])
+    if misses is not None:
+        ours["projection_std"] = _matrix(misses.std)
+        if misses.difference is not None:
+            ours["halves_difference"] = _matrix(misses.difference)
     if ours:
         content[_OURS] = ours
     write_whole(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120))

@@ -33,6 +33,6 @@ def covariance(
     held = U[ends[-1] :]
     groups = len(residuals)
     spread = (groups - 1) / groups * np.einsum("gi,gj->ij", scores, scores) + noise**2 * held.T @ held
-    robust = white @ spread @ white.T
-    lacking = noise**2 * (white**2).sum(axis=1) - np.diag(robust)
-    return robust + np.diag(np.maximum(lacking, 0.0))
+    robust = white @ (spread + (1e-3 * noise) ** 2 * np.eye(len(spread))) @ white.T  # without scores: as independent
+    wider = np.maximum(noise * np.linalg.norm(white, axis=1) / np.sqrt(np.diag(robust)), 1.0)
+    return robust * np.outer(wider, wider)

@@ -62,6 +62,12 @@ class Bend:
         """The places (m, board frame) of points that a flat board has at z = 0."""
         return points + (self.shapes(points) @ self.coefficients)[:, None] * [0.0, 0.0, 1.0]
 
+    def depth(self, points: Float[np.ndarray, "n 3"]) -> float:
+        """From the lowest to the highest of these points (m), over the plane that fits them best."""
+        bent = self.bent(points)
+        plane = np.column_stack([points[:, :2], np.ones(len(points))])
+        return float(np.ptp(bent[:, 2] - plane @ np.linalg.lstsq(plane, bent[:, 2], rcond=None)[0]))
+
 
 @dataclass(frozen=True, eq=False)
 class Fit:

@@ -34,9 +34,11 @@ PACKAGES = ("foundation", "calibration", "probnerf", "perception", "node", "fars
 LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     "foundation": (("bounded", "one_line", "whole_file"),),
     "calibration": (
-        ("boards", "camera", "turntable"),
-        ("calibrate", "camera_file", "print_board", "turntable_pose"),
-        ("coverage",),
+        ("boards", "camera", "deviations", "turntable"),
+        ("fit", "print_board", "turntable_pose"),
+        ("calibrate",),
+        ("coverage", "projection"),
+        ("camera_file",),
     ),
     "probnerf": (
         ("environment", "geometry", "pixel_status", "settings", "types"),
@@ -81,7 +83,13 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "safetensors": ("probnerf/prior/checkpoint.py",),
     "blackjax": (),  # an independent sampler to test against
     # pictures in a second, before matplotlib is imported; PNG files, resized
-    "cv2": ("calibration/*", "perception/*", "node/*/segment*.py", "probnerf/training/srn_dataset.py"),
+    "cv2": (
+        "calibration/*",
+        "perception/*",
+        "node/*/segment*.py",
+        "probnerf/training/srn_dataset.py",
+        "benchmarks/studies/intrinsics.py",
+    ),
     "scipy": (
         "node/figures/object_figure.py",  # morphology
         "node/figures/voxel_renderer.py",

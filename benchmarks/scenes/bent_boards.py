@@ -1,8 +1,8 @@
 """Views of a bent board by a known camera, with the errors of real corners: alike within a picture."""
 
-import cv2
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from calibration.boards import parse_board
 from calibration.camera import Camera
@@ -27,7 +27,7 @@ def bent_views(model: Model, count: int, seed: int) -> tuple[Camera, list[BoardV
     bent = corners + np.outer(_heights((corners - middle)[:, :2], rng), [0.0, 0.0, 1.0])
     views: list[BoardView] = []
     while len(views) < count:
-        R = cv2.Rodrigues(np.radians(rng.uniform(-_TILT, _TILT, 3)) * [1, 1, 0.5])[0]
+        R = Rotation.from_rotvec(np.radians(rng.uniform(-_TILT, _TILT, 3)) * [1, 1, 0.5]).as_matrix()
         ray = camera.rays(rng.uniform([60, 50], [580, 430])[None])[0]
         shift = ray / ray[2] * 2 * half * camera.K[0, 0] / (rng.uniform(0.25, 0.7) * SIZE[0]) - R @ middle
         placed = bent @ R.T + shift

@@ -1,14 +1,14 @@
 """Whether the stated deviations of a calibration are its errors, beside a fit of a flat board by OpenCV.
 
-A set of views of one board is drawn with a random camera, and calibrated in two halves. The board is bent to a sphere or
-a cylinder by 0.5 to 2 mm of 0.21 m. Errors of corners are 0.05 px each and 0.1 px that neighbours in a picture share
-(medians over pictures), and larger along a blur (`benchmarks/scenes/bent_boards.py`). Nothing was chosen by the real
-set, which is read from ../shared/data beside the checkout where it is there.
+A set of views of one board is drawn with a random camera, and calibrated in two halves. The board is bent to a sphere
+or a cylinder by 0.5 to 2 mm of 0.21 m. Errors of corners are 0.05 px each and 0.1 px that neighbours in a picture
+share (medians over pictures), and larger along a blur (`benchmarks/scenes/bent_boards.py`). Nothing was chosen by the
+real set, which is read from ../shared/data beside the checkout where it is there.
 
-- halves: difference of the two halves' estimates over the root of the sum of their squared deviations; root mean square
-  over sets. 1 is right, more is too sure. Gates of `farside`.
-- truth: the same of an estimate's error over its deviation. What the halves have in common, such as the bend, shows here
-  only.
+- halves: difference of the two halves' estimates over the root of the sum of their squared deviations; root mean
+  square over sets. 1 is right, more is too sure.
+- truth: the same of an estimate's error over its deviation. What the halves have in common, such as the bend, shows
+  here only.
 - error: root mean square error of the estimate.
 """
 
@@ -28,6 +28,7 @@ from calibration.boards import parse_board
 from calibration.calibrate import calibrate
 from calibration.camera import Camera
 from calibration.fit import BoardView, Model
+from perception.sources.pictures import open_pictures
 
 SETS, VIEWS = 60, 12  # views of a half
 GATE = (0.8, 1.3)
@@ -101,10 +102,10 @@ def _rms(values: Float[np.ndarray, "s n"]) -> Float[np.ndarray, "n"]:
 def _real() -> Table:
     """The whole real set and its halves, every second picture."""
     board, views = parse_board(REAL_BOARD), []
-    for file in sorted((DATA / REAL).glob("*.png")):
-        found = board.find(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE))
+    for picture in open_pictures(DATA / REAL)[0]:
+        found = board.find(picture.rgb)
         if found is not None:
-            views.append(BoardView(file.name, *found))
+            views.append(BoardView(picture.name, *found))
     parts = {"all": views, "even": views[::2], "odd": views[1::2]}
     said = {part: _estimates(chosen, "plumb_bob") for part, chosen in parts.items()}
     lines = []

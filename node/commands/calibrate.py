@@ -16,6 +16,7 @@ from calibration.camera_file import read_camera, write_camera
 from calibration.coverage import Coverage, coverage, next_views
 from calibration.fit import BoardView
 from calibration.print_board import Paper, write_target
+from calibration.projection import Projection, projection
 from node.commands.options import Calibrate
 from node.figures.calibration_figure import draw_calibration
 from perception.sources.open_source import open_source
@@ -55,12 +56,13 @@ def calibrate_camera(options: Calibrate, out: Console, err: Console) -> None:
     result = calibrate(views, size, options.model, config)
     seen = coverage(result.views, size)
     if result.trouble is not None:
-        report(result, seen, alike, unseen, out)
+        report(result, seen, None, alike, unseen, out)
         raise ValueError(f"{options.source}: nothing is saved: {result.trouble}")
     picture = options.out.with_name(f"{options.out.stem}_views.png")
-    draw_calibration(picture, result, seen)
-    write_camera(options.out, result.camera, options.name)
-    report(result, seen, alike, unseen, out)
+    misses = projection(result)
+    draw_calibration(picture, result, seen, misses)
+    write_camera(options.out, result.camera, options.name, misses)
+    report(result, seen, misses, alike, unseen, out)
     for written in (options.out, picture):
         out.print(f"  {written}", highlight=False, soft_wrap=True)
 
@@ -159,7 +161,9 @@ def _advice(found: Found, options: Calibrate, config: CalibrateConfig) -> str:
     return f"{seen}; next view: {advice[0]}"
 
 
-def report(result: Calibration, seen: Coverage, alike: int, unseen: list[str], out: Console) -> None:
+def report(
+    result: Calibration, seen: Coverage, misses: Projection | None, alike: int, unseen: list[str], out: Console
+) -> None:
     """The short table of a calibration, the views left out and why, and the view to take next."""
     camera = result.camera
     assert camera.K_std is not None and camera.distortion_std is not None and camera.rms is not None
@@ -177,8 +181,13 @@ def report(result: Calibration, seen: Coverage, alike: int, unseen: list[str], o
         "distortion": ", ".join(
             _pm(value, s, 4) for value, s in zip(camera.distortion, camera.distortion_std, strict=True)
         ),
+        "board": f"bent by {1000 * result.bend.depth(result.views[0].view.points):.1f} mm",
         "coverage": str(seen),
     }
+    if misses is not None:
+        rows["projection"] = f"± {misses.words(misses.std)}"
+        apart = misses.difference
+        rows["halves"] = "too few views" if apart is None else f"differ by {misses.words(apart)}"
     table = Table.grid(padding=(0, 2))
     for name, value in rows.items():
         table.add_row(f"  {name}", value)

@@ -10,16 +10,18 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from calibration.calibrate import Calibration
 from calibration.coverage import Coverage, next_views
+from calibration.projection import Projection
 from node.figures.object_figure import save_figure
 
 _COLOURS = "viridis"
+_PALE = "YlOrBr"
 
 
-def draw_calibration(path: Path, result: Calibration, seen: Coverage) -> None:
-    """Write a PNG: corners of all views, residuals magnified, corners per cell, and tilts with distances."""
-    figure = Figure(figsize=(13.0, 9.4), dpi=100, layout=ConstrainedLayoutEngine(w_pad=0.25, h_pad=0.1))
+def draw_calibration(path: Path, result: Calibration, seen: Coverage, misses: Projection) -> None:
+    """Write a PNG: corners, residuals magnified, corners per cell, tilts, and how far the projection may miss."""
+    figure = Figure(figsize=(19.0, 9.4), dpi=100, layout=ConstrainedLayoutEngine(w_pad=0.25, h_pad=0.1))
     camera = result.camera
-    (corners, residuals), (cells, leans) = figure.subplots(2, 2)
+    (corners, residuals, deviation), (cells, leans, halves) = figure.subplots(2, 3)
     used = f"{len(result.views)} views used, {len(result.dropped)} left out"
     figure.suptitle(f"{camera.model}, fx {camera.K[0, 0]:.1f} px, RMS {camera.rms:.3f} px, {used}", fontsize=13)
     _draw_corners(corners, result)
@@ -38,9 +40,14 @@ def draw_calibration(path: Path, result: Calibration, seen: Coverage) -> None:
     leans.set_xlabel("right side away (degrees)")
     leans.set_ylabel("lower side away (degrees)")
     leans.grid(color="#dddddd")
+    _draw_map(deviation, misses, misses.std, "standard deviation of the projection")
+    if misses.difference is None:
+        halves.set_title("too few views for two halves")
+    else:
+        _draw_map(halves, misses, misses.difference, "from one half of the views to the other: shift of the projection")
     advice = next_views(seen)
     figure.supxlabel(f"next view: {advice[0]}" if advice else "the coverage is good", fontsize=10, color="#b03020")
-    for ax in (corners, residuals, cells):
+    for ax in (corners, residuals, cells, deviation, halves):
         ax.set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal")
         ax.set_xlabel("x (px)")
         ax.set_ylabel("y (px)")
@@ -62,6 +69,27 @@ def _draw_corners(ax: Axes, result: Calibration) -> None:
         f"corners, a colour per view (+: principal point; worst view {worst.view.name}, {errors.max():.2f} px)"
     )
     ax.title.set_fontsize(10)
+
+
+def _draw_map(ax: Axes, misses: Projection, values: np.ndarray, title: str) -> None:
+    """Pixels over the picture, with the numbers; white where no ray is known."""
+    x, y = misses.places[0, :, 0], misses.places[:, 0, 1]
+    drawn = ax.pcolormesh(x, y, values, shading="nearest", cmap=_PALE, norm="log")
+    ax.figure.colorbar(drawn, ax=ax, label="px", shrink=0.75)
+    for (row, column), value in np.ndenumerate(values):
+        if np.isfinite(value):
+            across = {0: "left", len(x) - 1: "right"}.get(column, "center")
+            down = {0: "top", len(y) - 1: "bottom"}.get(row, "center")
+            ax.text(
+                x[column],
+                y[row],
+                f"{value:.2f}",
+                ha=across,
+                va=down,
+                fontsize=8,
+                color="white" if drawn.norm(value) > 0.6 else "#333333",
+            )
+    ax.set_title(title, fontsize=10)
 
 
 def _draw_residuals(ax: Axes, result: Calibration) -> None:

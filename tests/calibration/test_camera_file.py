@@ -8,6 +8,7 @@ import yaml
 
 from calibration.camera import Camera
 from calibration.camera_file import read_camera, write_camera
+from calibration.projection import Projection
 
 K = np.array([[520.123456789012, 0.0, 318.5], [0.0, 518.0, 243.2], [0.0, 0.0, 1.0]])
 MODELS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
@@ -53,6 +54,17 @@ def test_a_round_trip_is_exact(tmp_path: Path, model: str, known: bool) -> None:
     theirs = set(yaml.safe_load(ROS))
     assert theirs <= set(content) <= theirs | {"farside_calibration"} and content["camera_name"] == "left"
     assert content["projection_matrix"]["data"][:3] == [K[0, 0], 0.0, K[0, 2]]
+
+
+def test_what_the_projection_misses_is_in_the_file(tmp_path: Path) -> None:
+    std, shift = np.full((7, 9), 0.5), np.full((7, 9, 2), [3.0, 4.0])
+    std[0, 0] = np.nan
+    path = tmp_path / "a.yaml"
+    write_camera(path, Camera(640, 480, K, np.zeros(5)), misses=Projection(np.zeros((7, 9, 2)), std, shift))
+    ours = yaml.safe_load(path.read_text())["farside_calibration"]
+    np.testing.assert_array_equal(np.reshape(ours["projection_std"]["data"], (7, 9)), std)
+    assert ours["halves_difference"] == {"rows": 7, "cols": 9, "data": [5.0] * 63}
+    assert read_camera(path).K_std is None
 
 
 def test_a_file_of_ros_is_read(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from calibration.boards import parse_board
 from calibration.calibrate import CalibrateConfig, calibrate
 from calibration.camera_file import read_camera, write_camera
 from calibration.coverage import coverage
+from calibration.projection import projection
 from node.__main__ import main
 from node.commands.calibrate import find_views
 from node.commands.options import Calibrate
@@ -63,6 +64,7 @@ def test_a_folder_becomes_a_camera_file(
     assert main(["calibrate", str(source), "--out", str(out), "--name", "left"]) == 0
     said = capsys.readouterr().out
     assert "6 used, 1 without the board" in said and "next view: " in said and "±" in said
+    assert "at worst" in said and "halves" in said and "bent by" in said
     camera = read_camera(out)
     for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)):
         assert abs(camera.K[i, j] - CAMERAS["plumb_bob"].K[i, j]) < 5 * camera.K_std[i, j]
@@ -155,7 +157,7 @@ def test_help_reads(capsys: pytest.CaptureFixture) -> None:
 def test_the_picture_is_drawn(tmp_path: Path) -> None:
     path = tmp_path / "new" / "views.png"
     result = calibrate(views("equidistant", 5), SIZE, "equidistant")
-    draw_calibration(path, result, coverage(result.views, SIZE))
+    draw_calibration(path, result, coverage(result.views, SIZE), projection(result))
     image = cv2.imread(str(path))
     assert image.shape[0] > 800 and len(np.unique(image.reshape(-1, 3), axis=0)) > 200
 
