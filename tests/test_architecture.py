@@ -36,9 +36,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     "calibration": (
         ("boards", "camera", "deviations", "turntable"),
         ("fit", "print_board", "turntable_pose"),
-        ("calibrate",),
-        ("coverage", "projection"),
-        ("camera_file",),
+        ("calibrate", "camera_file", "coverage", "projection"),
     ),
     "probnerf": (
         ("environment", "geometry", "pixel_status", "settings", "types"),
@@ -87,8 +85,8 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
         "calibration/*",
         "perception/*",
         "node/*/segment*.py",
-        "probnerf/training/srn_dataset.py",
-        "benchmarks/studies/intrinsics.py",
+        "probnerf/*/srn_dataset.py",
+        "benchmarks/*/intrinsics.py",
     ),
     "scipy": (
         "node/figures/object_figure.py",  # morphology
