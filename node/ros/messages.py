@@ -18,6 +18,7 @@ from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
 from foundation.one_line import one_line
+from node.ros.foreign_types import MESSAGES, SERVICES
 from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
 from perception.observation.object_frame import ObjectFrame
@@ -31,20 +32,6 @@ FOLDER = next((folder for folder in _PLACES if folder.is_dir()), _PLACES[0])
 HYPOTHESES = "farside_msgs/msg/ShapeHypotheses"
 QUERY_REGION = "farside_msgs/srv/QueryRegion"
 NEXT_VIEW = "farside_msgs/srv/NextView"
-# Services of every node of ROS 2, of which rosbags has no text.
-PARAMETER_SERVICES = {
-    "rcl_interfaces/srv/GetParameters": "string[] names\n---\nrcl_interfaces/ParameterValue[] values\n",
-    "rcl_interfaces/srv/GetParameterTypes": "string[] names\n---\nuint8[] types\n",
-    "rcl_interfaces/srv/ListParameters": (
-        "string[] prefixes\nuint64 depth\n---\nrcl_interfaces/ListParametersResult result\n"
-    ),
-    "rcl_interfaces/srv/DescribeParameters": (
-        "string[] names\n---\nrcl_interfaces/ParameterDescriptor[] descriptors\n"
-    ),
-    "rcl_interfaces/srv/SetParameters": (
-        "rcl_interfaces/Parameter[] parameters\n---\nrcl_interfaces/SetParametersResult[] results\n"
-    ),
-}
 EVENT = """service_msgs/ServiceEventInfo info
 {name}_Request[<=1] request
 {name}_Response[<=1] response
@@ -53,14 +40,16 @@ EVENT = """service_msgs/ServiceEventInfo info
 
 @cache
 def types() -> Typestore:
-    """All types of ROS 2 Jazzy and those of farside_msgs. Raises FileNotFoundError if the definitions are absent."""
+    """All types of ROS 2 Jazzy, those of farside_msgs, and those of `foreign_types`. Raises FileNotFoundError if the definitions are absent."""
     store = get_typestore(Stores.ROS2_JAZZY)
     store.fielddefs = _mended(store.fielddefs)
     if not (FOLDER / "package.xml").is_file():
         raise FileNotFoundError(f"{FOLDER} is missing; install Farside again")
     for path in sorted(FOLDER.glob("msg/*.msg")):
         _register(store, f"{FOLDER.name}/msg/{path.stem}", path.read_text(encoding="utf-8"))
-    for name, text in PARAMETER_SERVICES.items():
+    for name, text in MESSAGES.items():
+        _register(store, name, text)
+    for name, text in SERVICES.items():
         register_service(name, text, store)
     for path in sorted(FOLDER.glob("srv/*.srv")):
         register_service(f"{FOLDER.name}/srv/{path.stem}", path.read_text(encoding="utf-8"), store)

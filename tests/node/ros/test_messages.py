@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from node.ros.foreign_types import MESSAGES, SERVICES
 from node.ros.messages import (
     FOLDER,
     HYPOTHESES,
     NEXT_VIEW,
-    PARAMETER_SERVICES,
     QUERY_REGION,
     decode,
     encode,
@@ -27,7 +27,7 @@ from node.ros.messages import (
 from tests.node.peer import ADD, ADD_TEXT
 from tests.node.shapes import body_with_handle
 
-PARTS = [f"{s}_{part}" for s in (QUERY_REGION, NEXT_VIEW, *PARAMETER_SERVICES) for part in ("Request", "Response")]
+PARTS = [f"{s}_{part}" for s in (QUERY_REGION, NEXT_VIEW, *SERVICES) for part in ("Request", "Response")]
 SENT = (
     "sensor_msgs/msg/PointCloud2",
     "sensor_msgs/msg/Image",
@@ -37,6 +37,13 @@ SENT = (
     "diagnostic_msgs/msg/DiagnosticArray",
     "tf2_msgs/msg/TFMessage",
 )
+# As ROS 2's own generator (rosidl) writes them into packages that were built from the .msg files.
+BUILT = {
+    "moveit_msgs/msg/PlanningScene": "0f58540ad5eab4b9ea827d53b763c793d8cabd202b3b301fcee25afa4ce1bd80",
+    "moveit_msgs/msg/CollisionObject": "74b0acd6d56be032bf4f764b2c2633f50588b5fb2bd71e97206c59052747cf7e",
+    "octomap_msgs/msg/Octomap": "9891a19a05b70ec20aa8f45db3f8300b9ab80afff32c61c549d25087da9625b0",
+    "vision_msgs/msg/Detection3DArray": "793f5eab9595ac1c0da07873cc859db42eae51f0ee76056db8562515d830e018",
+}
 
 
 def test_hashes_known_from_ros() -> None:
@@ -45,6 +52,8 @@ def test_hashes_known_from_ros() -> None:
     assert type_hash("std_msgs/msg/String") == string
     get = "RIHS01_bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc"
     assert type_hash("rcl_interfaces/srv/GetParameters") == get
+    for kind, digest in BUILT.items():
+        assert type_hash(kind) == f"RIHS01_{digest}"
     with pytest.raises(ValueError, match="the type 'std_msgs/msg/Strin' is unknown"):
         type_hash("std_msgs/msg/Strin")
 
@@ -86,7 +95,7 @@ def services() -> None:
     register_service(ADD, ADD_TEXT)
 
 
-@pytest.mark.parametrize("kind", [*SENT, HYPOTHESES, *PARTS])
+@pytest.mark.parametrize("kind", [*SENT, HYPOTHESES, *MESSAGES, *PARTS])
 def test_an_empty_message_comes_back(kind: str) -> None:
     data = encode(make(kind))
     assert data[:4] == b"\x00\x01\x00\x00"  # CDR, little-endian
