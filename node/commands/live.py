@@ -16,6 +16,8 @@ from rich.console import Console
 from calibration.camera_file import read_camera
 from node.commands.options import LiveConfig
 from node.ros.bus import Bus
+from node.ros.clock import Clock
+from node.ros.frame_tree import FrameTree
 from node.ros.messages import HYPOTHESES, definition, encode, hypotheses_message
 from node.ros.parameters import flat, serve_parameters
 from node.ros.publishers import Announcer
@@ -65,7 +67,8 @@ def live(config: LiveConfig, out: Console, err: Console) -> None:
         if config.record is not None:
             recorder = Recorder(config.record, config.recording)
             stack.callback(_close, recorder)
-        announcer = Announcer(bus)
+        clock = Clock(bus, config.bus.use_sim_time)
+        announcer = Announcer(bus, config.planner, clock)
         reader = Reader(source)
         keeper = _Keeper(
             reader.listen("keeper"),
@@ -78,9 +81,10 @@ def live(config: LiveConfig, out: Console, err: Console) -> None:
             warm_up(tracker)  # before the first frame: its stalls would hold up the reader
         stack.enter_context(reader)
         keeper.thread.start()
-        node = LiveNode(config, tracker, announcer, reader, keeper, recorder, err)
-        node.answers.serve(bus)
-        serve_parameters(bus, flat(config))
+        answers = Answers(announcer.node, config.planner, FrameTree(bus), clock)
+        node = LiveNode(config, tracker, announcer, answers, reader, keeper, recorder, err)
+        answers.serve(bus)
+        serve_parameters(bus, flat(config) | {"use_sim_time": config.bus.use_sim_time})
         if page is not None:
             node.show = page.show
             out.print(f"{page.address} shows it", highlight=False, soft_wrap=True)
@@ -164,6 +168,7 @@ class LiveNode:
         config: LiveConfig,
         tracker: Tracker,
         announcer: Announcer,
+        answers: Answers,
         reader: Reader,
         keeper: _Keeper,
         recorder: Recorder | None,
@@ -171,7 +176,7 @@ class LiveNode:
     ) -> None:
         self.config, self.tracker, self.announcer, self.reader = config, tracker, announcer, reader
         self.keeper, self.recorder, self.err = keeper, recorder, err
-        self.answers = Answers(announcer.node)
+        self.answers = answers
         self.show: Callable[..., None] | None = None
         self.frames = self.inferences = self.answered = 0
         self._scene: dict[int, Hypotheses] = {}

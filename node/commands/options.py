@@ -12,7 +12,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from calibration.turntable import TurntableConfig
-from node.ros.settings import BusConfig, TopicConfig
+from node.ros.settings import BusConfig, PlannerConfig, TopicConfig
 from perception.inference.settings import ControllerConfig, TrackConfig
 from perception.observation.settings import SegmentConfig
 from perception.sources.settings import SHIPPED_LOG, RecordConfig
@@ -174,6 +174,7 @@ class LiveConfig:
     """Weights of another prior."""
     bus: BusConfig = field(default_factory=lambda: BusConfig(listen=(ENDPOINT,)))
     topic: TopicConfig = field(default_factory=TopicConfig)
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
     recording: RecordConfig = field(default_factory=RecordConfig)
     segment: SegmentConfig = field(default_factory=SegmentConfig)
     controller: ControllerConfig = field(default_factory=ControllerConfig)

@@ -159,10 +159,11 @@ class Bus:
     def serve(self, name: str, kind: str, handler: Callable[[Any], Any], *, depth: int = 10) -> str:
         """Answer a service's requests with `handler`, one at a time in a thread of its own. Returns the full name.
 
-        An error in `handler` becomes a response with success = false and the error's line as message, if the type has
-        these.
+        An error in `handler` becomes a response with success = false, and the error's line as message, as far as the
+        type has these.
         """
         name, where, _ = self._entity("SS", name, kind, quality(depth))
+        own = vars(make(f"{kind}_Response"))
         queryable = self._session.declare_queryable(where, zenoh.handlers.RingChannel(depth), complete=True)
 
         def answer(query: Any, tag: tuple[int, bytes], response: Any) -> None:
@@ -177,9 +178,12 @@ class Bus:
             answer(query, tag, handler(request))
 
         def refuse(query: Any, trouble: str) -> None:
+            told = {name: value for name, value in (("success", False), ("message", trouble)) if name in own}
             try:
-                answer(query, _tag(query), make(f"{kind}_Response", success=False, message=trouble))
-            except ValueError:  # its response has no such fields, or the query no sender
+                if "success" not in told:
+                    raise ValueError
+                answer(query, _tag(query), make(f"{kind}_Response", **told))
+            except ValueError:  # its response cannot say so, or the query has no sender
                 query.reply_err(trouble.encode())
 
         self._run(name, queryable, take, refuse)

@@ -40,7 +40,10 @@ EVENT = """service_msgs/ServiceEventInfo info
 
 @cache
 def types() -> Typestore:
-    """All types of ROS 2 Jazzy, those of farside_msgs, and those of `foreign_types`. Raises FileNotFoundError if the definitions are absent."""
+    """All types of ROS 2 Jazzy, of farside_msgs, and of `foreign_types`.
+
+    Raises FileNotFoundError if the definitions are absent.
+    """
     store = get_typestore(Stores.ROS2_JAZZY)
     store.fielddefs = _mended(store.fielddefs)
     if not (FOLDER / "package.xml").is_file():

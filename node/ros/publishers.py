@@ -1,11 +1,19 @@
 """The topics that the node publishes for each scene, for planners, people and ROS 2 tools."""
 
-import time
 from collections.abc import Callable, Sequence
 
 from calibration.camera import Camera
 from node.ros.bus import Bus, Publisher
+from node.ros.clock import Clock
 from node.ros.messages import HYPOTHESES, frame_messages, hypotheses_message
+from node.ros.planner_messages import (
+    DETECTIONS,
+    OCTOMAP,
+    PLANNING_SCENE,
+    SceneDifferences,
+    detections_message,
+    octomap_message,
+)
 from node.ros.scene_messages import (
     DiagnosticStatus,
     counts_status,
@@ -16,6 +24,7 @@ from node.ros.scene_messages import (
     transforms_message,
     uncertainty_message,
 )
+from node.ros.settings import PlannerConfig
 from perception.answers.hypotheses import Hypotheses
 from perception.sources.frame import Frame
 
@@ -24,18 +33,23 @@ LATCHED = 8  # objects whose hypotheses a late subscriber gets
 
 
 class Announcer:
-    """Publishes ~/hypotheses (latched), ~/occupancy, ~/markers, ~/uncertainty, /diagnostics, /tf, and the camera's
-    ~/color/image_raw, ~/color/camera_info and ~/depth/image_raw. A topic without subscribers is not computed.
+    """Publishes ~/hypotheses (latched), ~/occupancy, ~/markers, ~/uncertainty, /diagnostics, /tf, for planners
+    ~/planning_scene, ~/octomap and ~/detections, and the camera's ~/color/image_raw, ~/color/camera_info and
+    ~/depth/image_raw. A topic without subscribers is not computed.
     """
 
-    def __init__(self, bus: Bus) -> None:
-        self._bus = bus
+    def __init__(self, bus: Bus, planner: PlannerConfig | None = None, clock: Clock | None = None) -> None:
+        self._bus, self._planner, self._clock = bus, planner or PlannerConfig(), clock or Clock()
         self._node = bus.node.resolve("~/object").removesuffix("/object")
         self._hypotheses = bus.publisher("~/hypotheses", HYPOTHESES, latched=True, depth=LATCHED)
         self._occupancy = bus.publisher("~/occupancy", "sensor_msgs/msg/PointCloud2")
         self._markers = bus.publisher("~/markers", "visualization_msgs/msg/MarkerArray")
         self._uncertainty = bus.publisher("~/uncertainty", "sensor_msgs/msg/Image")
         self._diagnostics = bus.publisher("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+        self._planning_scene = bus.publisher(self._planner.scene, PLANNING_SCENE, depth=10)
+        self._octomap = bus.publisher("~/octomap", OCTOMAP)
+        self._detections = bus.publisher("~/detections", DETECTIONS)
+        self._differences = SceneDifferences(self._node, self._planner)
         images = {name: f"sensor_msgs/msg/{kind}" for name, kind in _CAMERA.items()}
         self._camera = {name: bus.publisher(f"~/{name}", kind) for name, kind in images.items()}
         self._tf = bus.publisher("/tf", "tf2_msgs/msg/TFMessage", depth=100)
@@ -55,6 +69,7 @@ class Announcer:
         """Publish everything about one scene. `camera` is that of the picture."""
         for h in objects:
             self._hypotheses.publish(hypotheses_message(h, method))
+        self._plan(objects)
         if not objects:
             return
         self._tf.publish(transforms_message(objects, self._node))
@@ -62,13 +77,21 @@ class Announcer:
             (self._occupancy, lambda: occupancy_message(objects)),
             (self._markers, lambda: markers_message(objects)),
             (self._uncertainty, lambda: uncertainty_message(objects, camera)),
+            (self._octomap, lambda: octomap_message(objects, self._node, self._planner.octomap_m)),
+            (self._detections, lambda: detections_message(objects)),
         ]
         for publisher, build in views:
             if publisher.wanted:
                 publisher.publish(build())
 
+    def _plan(self, objects: Sequence[Hypotheses]) -> None:
+        """Publish the planning scene's difference to the one that was published last; also to say that all is gone."""
+        if self._planning_scene.wanted and (message := self._differences.message(objects)) is not None:
+            if self._planning_scene.publish(message):
+                self._differences.sent()
+
     def status(self, objects: Sequence[Hypotheses], others: Sequence[DiagnosticStatus] = ()) -> None:
         """Publish /diagnostics: the sampler's state for each object, the bus's counts, and `others` (camera, rates)."""
-        now = time.time_ns()
+        now = self._clock.now_ns()
         statuses = [*others, *(sampler_status(h, now) for h in objects), counts_status(self._bus.counts.all())]
         self._diagnostics.publish(diagnostics_message(now, statuses))

@@ -1,18 +1,23 @@
 """The node's services: requests become questions to `perception`, answers become responses."""
 
-import time
 from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from node.ros.bus import Bus
+from node.ros.clock import Clock
+from node.ros.frame_tree import FrameTree, plain
 from node.ros.messages import NEXT_VIEW, QUERY_REGION, make, matrix, pose, time_message
+from node.ros.planner_messages import ESDF, esdf_response
 from node.ros.scene_messages import object_frame_id
+from node.ros.settings import PlannerConfig
 from perception.answers.hypotheses import FrameName, Hypotheses
+from perception.answers.occupied_space import distance_field
 from perception.answers.query import query
-from perception.answers.regions import Box, Points, Region, Swept
+from perception.answers.regions import Box, Points, Swept, moved
 from perception.answers.scene import Scene
 
 BOX, POINTS, SWEPT = 0, 1, 2  # kinds of a QueryRegion request
@@ -24,15 +29,26 @@ MAX_VIEWS = 100
 class Answers:
     """The newest scene. Every answer reads it whole: inference may replace it at any time, from any thread."""
 
-    def __init__(self, node: str = "/farside") -> None:
-        """`node` is the node's full name. The names of its objects' frames begin with it."""
-        self.node = node
+    def __init__(
+        self,
+        node: str = "/farside",
+        planner: PlannerConfig | None = None,
+        frames: FrameTree | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        """`node` is the node's full name. The names of its objects' frames begin with it. `frames` are those of the
+        robot, in which may be asked, too. Ages are by `clock`.
+        """
+        self.node, self.planner, self.frames = node, planner or PlannerConfig(), frames or FrameTree()
+        self.clock = clock or Clock()
         self._scene: Scene | None = None
 
     def update(self, objects: Sequence[Hypotheses]) -> None:
         """Replace the scene. What answers need is computed first, so that they do not wait."""
         for h in objects:
             _ = h.p_occupied, h.twins  # cached; p_occupied fills `solid`
+        if objects:
+            self.frames.pin(objects[0].stamp_ns)
         self._scene = Scene(tuple(objects)) if objects else None
 
     @property
@@ -43,15 +59,19 @@ class Answers:
         return scene
 
     def serve(self, bus: Bus) -> None:
-        """Offer ~/query_region and ~/next_view."""
+        """Offer ~/query_region, ~/next_view and ~/get_esdf_and_gradient."""
         bus.serve("~/query_region", QUERY_REGION, self.query_region)
         bus.serve("~/next_view", NEXT_VIEW, self.next_view)
+        bus.serve("~/get_esdf_and_gradient", ESDF, self.distances)
 
     def query_region(self, request: Any) -> Any:
         """Answer a farside_msgs/QueryRegion request. Raises ValueError in one line for an invalid request."""
         scene = self._asked(request)
         objects = scene.objects
-        found = query(objects, _region(request), self._frame(request.header.frame_id, objects))
+        (frame, T_frame_asked), region = self._frame(request.header.frame_id, objects), _region(request)
+        if T_frame_asked is not None:
+            region = moved(region, T_frame_asked)
+        found = query(objects, region, frame, self.clock.now_ns())
         blocked = np.array([(o, row) for o, rows in found.blocked_by.items() for row in rows], np.int64).reshape(-1, 2)
         return make(
             f"{QUERY_REGION}_Response",
@@ -79,7 +99,7 @@ class Answers:
         """
         scene = self._asked(request)
         objects = scene.objects
-        T_object_frame = objects[0].T_object_from(self._frame(request.header.frame_id, objects))
+        T_object_frame = self._T_object(request.header.frame_id, objects)
         candidates = len(request.candidates)
         if max(candidates, request.count) > MAX_VIEWS:
             raise ValueError(f"{max(candidates, request.count)} views are too many; give at most {MAX_VIEWS}")
@@ -92,10 +112,29 @@ class Answers:
         return make(
             f"{NEXT_VIEW}_Response",
             success=True,
-            **_about(scene, (time.time_ns() - min(h.stamp_ns for h in scene)) * 1e-9),
+            **_about(scene, (self.clock.now_ns() - min(h.stamp_ns for h in scene)) * 1e-9),
             poses=[pose(T_frame_object @ T) for T in ranked.T_object_camera],
             gain_nats=np.asarray(ranked.gain_nats, np.float64),
         )
+
+    def distances(self, request: Any) -> Any:
+        """Answer an nvblox_msgs/EsdfAndGradients request, about all objects. The answer is always up to date, what is
+        cleared is so for it alone, and nothing is visualised. Raises ValueError in one line for an invalid request.
+        """
+        objects = self.scene.objects
+        T_frame_object = np.linalg.inv(self._T_object(request.frame_id, objects))
+        T_frame_camera = T_frame_object @ np.linalg.inv(objects[0].object_frame.T_camera_object)
+        low, c = _xyz(request.aabb_min_m), self.planner
+        field = distance_field(
+            objects,
+            T_frame_camera,
+            (low, low + _xyz(request.aabb_size_m)) if request.use_aabb else None,
+            c.risk,
+            c.distance_m,
+            c.farthest_m,
+            lambda points: _cleared(request, points),
+        )
+        return esdf_response(field, min(h.stamp_ns for h in objects), request.frame_id, c.unknown_m)
 
     def _asked(self, request: Any) -> Scene:
         """The newest scene, or the one object of it that a request names."""
@@ -104,21 +143,53 @@ class Answers:
             return scene
         return Scene((scene.by_id(request.object_id),))
 
-    def _frame(self, name: str, objects: Sequence[Hypotheses]) -> FrameName:
-        """The frame that a request's frame_id names. Raises ValueError for an unknown one, and for an object's frame if
-        the request is about several objects.
+    def _T_object(self, name: str, objects: Sequence[Hypotheses]) -> Float[np.ndarray, "4 4"]:
+        """p_object = T @ p_frame of the first object and the frame that a frame_id names; raises as `_frame`."""
+        frame, T_frame_asked = self._frame(name, objects)
+        T = objects[0].T_object_from(frame)
+        return T if T_frame_asked is None else T @ T_frame_asked
+
+    def _frame(self, name: str, objects: Sequence[Hypotheses]) -> tuple[FrameName, Float[np.ndarray, "4 4"] | None]:
+        """The frame of hypotheses that a request's frame_id names; or the camera's, and p_camera = T @ p_asked, if it
+        names one that /tf connects to the camera's.
+
+        Raises ValueError for an unknown one, and for an object's frame if the request is about several objects.
         """
+        name, camera = plain(name), plain(objects[0].frame_id)
         own = [object_frame_id(self.node, h.object_id) for h in objects]
         aliases: dict[str, FrameName] = {"object": "object", "camera": "camera", "world": "world"}
-        aliases |= {objects[0].frame_id: "camera", **dict.fromkeys(own, "object")}
+        if objects[0].T_world_camera is None and self.frames.knows("world"):
+            del aliases["world"]
+        aliases |= {camera: "camera", **dict.fromkeys(own, "object")}
         if name not in aliases:
-            raise ValueError(f"frame_id is {name!r}; give one of {', '.join(aliases)}")
+            if self.frames.knows(name):
+                return "camera", self.frames.T(camera, name, objects[0].stamp_ns)
+            raise ValueError(f"frame_id is {name!r}; give one of {', '.join(aliases)}, or one that is on /tf")
         if aliases[name] == "object" and len(objects) > 1:
             raise ValueError(
                 f"frame_id {name!r} is ambiguous with {len(objects)} objects; give the object_id of one,"
                 " or ask in the frame camera or world"
             )
-        return aliases[name]
+        return aliases[name], None
+
+
+def _xyz(message: Any) -> Float[np.ndarray, "3"]:
+    return np.array([message.x, message.y, message.z], np.float64)
+
+
+def _cleared(request: Any, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    """Which points lie in the boxes and spheres that an EsdfAndGradients request wants cleared."""
+    boxes, spheres = (request.aabbs_to_clear_min_m, request.aabbs_to_clear_size_m), request.spheres_to_clear_center_m
+    if len(boxes[0]) != len(boxes[1]) or len(spheres) != len(request.spheres_to_clear_radius_m):
+        raise ValueError(
+            "of what is to be cleared, each box needs a corner and a size, each sphere a centre and a radius"
+        )
+    inside = np.zeros(len(points), bool)
+    for low, size in zip(map(_xyz, boxes[0]), map(_xyz, boxes[1]), strict=True):
+        inside |= np.all((points >= low) & (points <= low + size), axis=1)
+    for centre, radius in zip(map(_xyz, spheres), request.spheres_to_clear_radius_m, strict=True):
+        inside |= np.linalg.norm(points - centre, axis=1) <= radius
+    return inside
 
 
 def _about(scene: Scene, age_s: float) -> dict[str, Any]:
@@ -126,7 +197,7 @@ def _about(scene: Scene, age_s: float) -> dict[str, Any]:
     return {"stamp": time_message(min(h.stamp_ns for h in scene)), "stage": min(h.stage for h in scene), "age": age_s}
 
 
-def _region(request: Any) -> Region:
+def _region(request: Any) -> Box | Points | Swept:
     if request.kind == BOX:
         low, high = ((p.x, p.y, p.z) for p in (request.box_low, request.box_high))
         return Box(low, high)

@@ -31,6 +31,7 @@ class BusConfig:
     max_message_bytes: int = 64_000_000
     max_request_bytes: int = 4_000_000  # of a service's request
     max_rate: float = 200.0  # messages per second of each topic and service, in and out
+    use_sim_time: bool = False  # ages and diagnostics are by the time on /clock, of a simulation or a recording
 
     def __post_init__(self) -> None:
         if not 0 <= self.domain_id <= 232:
@@ -117,3 +118,25 @@ class TopicConfig:
             raise ValueError("tolerance_ms must not be negative, silence_s be positive, and waiting be 1 or more")
         if self.depth is not None and (word := named_otherwise(self.depth)):
             raise ValueError(f"topic: depth is {self.depth}, whose name says {word}; give the camera's depth image")
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """What planners get: MoveIt's planning scene, an octomap, and signed distances as nvblox serves them."""
+
+    risk: float = 0.05  # space counts as occupied where its probability of being occupied is above this
+    scene: str = "~/planning_scene"  # topic of the differences; MoveIt takes those on /planning_scene by itself
+    mesh_grid: int = 32  # voxels per axis of an object's mesh, at most; fewer are wider, and checked faster
+    octomap_m: float = 0.005  # edge of a voxel of the octomap
+    scene_octomap: bool = False  # the scene has the octomap, too, in place of one that MoveIt itself made
+    distance_m: float = 0.01  # edge of a voxel of the distances
+    farthest_m: float = 2.0  # distances end here
+    unknown_m: float = -1000.0  # distance where nothing was inferred, as nvblox has it; 1000: such space is free
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.risk < 1.0:
+            raise ValueError(f"planner: risk is {self.risk:g}; give a probability above 0 and below 1")
+        if self.mesh_grid < 4 or not min(self.octomap_m, self.distance_m, self.farthest_m) >= 1e-4:
+            raise ValueError(
+                "planner: mesh_grid must be 4 or more, octomap_m, distance_m and farthest_m 0.1 mm or more"
+            )

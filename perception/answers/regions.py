@@ -89,6 +89,17 @@ class Cells:
 Region = Box | Points | Swept | Cells
 
 
+def moved(region: Box | Points | Swept, T_other_frame: Float[np.ndarray, "4 4"]) -> Points | Swept:
+    """The same region in another frame: p_other = T_other_frame @ p_frame. A box becomes one that may be turned."""
+    if isinstance(region, Points):
+        return Points(region.points @ T_other_frame[:3, :3].T + T_other_frame[:3, 3])
+    if isinstance(region, Swept):
+        return Swept(T_other_frame @ region.T_frame_box, region.size)
+    T = np.eye(4)
+    T[:3, 3] = 0.5 * np.add(region.low, region.high)
+    return Swept((T_other_frame @ T)[None], np.subtract(region.high, region.low)[None])
+
+
 def read_points(path: str | Path) -> Points:
     """Read an .xyz file: one point a line, x y z in metres; further columns and # comments are ignored.
 
