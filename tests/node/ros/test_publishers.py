@@ -4,13 +4,15 @@ import time
 from typing import Any
 
 import numpy as np
+import pytest
 
 from calibration.camera import Camera
 from node.ros.bus import Bus
 from node.ros.messages import HYPOTHESES, hypotheses_from
+from node.ros.planner_messages import DETECTIONS, OCTOMAP, PLANNING_SCENE
 from node.ros.publishers import Announcer
 from node.ros.scene_messages import DiagnosticStatus
-from node.ros.settings import BusConfig, TopicConfig
+from node.ros.settings import BusConfig, PlannerConfig, TopicConfig
 from node.ros.topic_source import TopicSource
 from perception.sources.frame import Frame
 from tests.node.shapes import body_with_handle
@@ -23,6 +25,9 @@ TOPICS = {
     "~/uncertainty": "sensor_msgs/msg/Image",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "/tf": "tf2_msgs/msg/TFMessage",
+    "~/planning_scene": PLANNING_SCENE,
+    "~/octomap": OCTOMAP,
+    "~/detections": DETECTIONS,
 }
 
 
@@ -47,8 +52,45 @@ def test_every_topic_carries_the_scene() -> None:
         assert len(came["/tf"][0].transforms) == 2
         names = [status.name for status in came["/diagnostics"][0].status]
         assert names == ["farside: camera", "farside: object 1", "farside: object 2", "farside: bus"]
-        announcer.scene([], CAMERA)  # says nothing
-        assert not {"~/occupancy", "~/markers", "~/uncertainty"} - {name for name in came if len(came[name]) == 1}
+        assert len(came["~/detections"][0].detections) == 2
+        announcer.scene([], CAMERA)  # says only to MoveIt that all is gone
+        deadline = time.monotonic() + 20.0
+        while len(came["~/planning_scene"]) < 2 and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert [[(it.id, it.operation) for it in m.world.collision_objects] for m in came["~/planning_scene"]] == [
+            [("robot_farside_object_1", operation), ("robot_farside_object_2", operation)] for operation in (0, 1)
+        ]
+        once = {"~/occupancy", "~/markers", "~/uncertainty", "~/octomap", "~/detections"}
+        assert not once - {name for name in came if len(came[name]) == 1}
+
+
+def test_what_nobody_listens_to_is_not_worked_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise AssertionError("worked out for nobody")
+
+    for name in (
+        "occupancy_message",
+        "markers_message",
+        "uncertainty_message",
+        "octomap_message",
+        "detections_message",
+    ):
+        monkeypatch.setattr(f"node.ros.publishers.{name}", fail)
+    monkeypatch.setattr("node.ros.publishers.SceneDifferences.message", fail)
+    with Bus(BusConfig()) as bus:
+        Announcer(bus).scene([body_with_handle()], CAMERA)
+
+
+def test_the_planning_scene_may_go_to_moveits_own_topic() -> None:
+    came: list[Any] = []
+    with Bus(BusConfig()) as bus:
+        announcer = Announcer(bus, PlannerConfig(scene="/planning_scene"))
+        bus.subscribe("/planning_scene", PLANNING_SCENE, came.append)
+        deadline = time.monotonic() + 20.0
+        while not came and time.monotonic() < deadline:
+            announcer.scene([body_with_handle()], CAMERA)
+            time.sleep(0.02)
+    assert came
 
 
 def test_a_frame_comes_back_from_the_bus() -> None:
