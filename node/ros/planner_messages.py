@@ -173,8 +173,13 @@ def _ends(h: Hypotheses) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S
 
 
 def esdf_response(field: DistanceField, stamp_ns: int, frame_id: str, unknown: float) -> Any:
-    """The response of nvblox_msgs/EsdfAndGradients. nvblox has no gradients in it, in spite of its name."""
-    count = field.distance.shape
+    """The response of nvblox_msgs/EsdfAndGradients. nvblox has no gradients in it, in spite of its name.
+
+    nvblox measures to the centres of the outermost occupied voxels, where the distance is 0: half a voxel beyond their
+    border.
+    """
+    distance = field.distance + np.float32(0.5 * field.width)
+    count = distance.shape
     strides = (int(np.prod(count)), count[1] * count[2], count[2])
     dim = [
         make("std_msgs/msg/MultiArrayDimension", label=label, size=size, stride=stride)
@@ -189,7 +194,7 @@ def esdf_response(field: DistanceField, stamp_ns: int, frame_id: str, unknown: f
         esdf_and_gradients=make(
             "std_msgs/msg/Float32MultiArray",
             layout=make("std_msgs/msg/MultiArrayLayout", dim=dim),
-            data=np.where(np.isnan(field.distance), np.float32(unknown), field.distance).ravel(),
+            data=np.where(np.isnan(distance), np.float32(unknown), distance).ravel(),
         ),
         success=True,
     )

@@ -90,11 +90,11 @@ def distance_field(
 ) -> DistanceField:
     """Signed distance to where some object's P(occupied) is above the risk.
 
-    `box` is (low, high) in metres in the frame; None: all cubes. Cells that it meets in part belong to it. Distances
-    are correct to the diagonal of a cell, reach to objects outside the box, and end at `farthest` (m). NaN is what lies
-    outside of every object's cube, or in the table: nobody said anything about it. Where `cleared` holds of a cell's
-    centre (m, in the frame) the cell is taken for free. Raises ValueError for a box that is
-    empty, not finite or too large.
+    `box` is (low, high) in metres in the frame; None: all cubes. Cells that it meets belong to it, and those that begin
+    at its upper faces, as in nvblox. Distances are correct to the diagonal of a cell, reach to objects outside the box,
+    and end at `farthest` (m). NaN is what lies outside of every object's cube, or in the table: nobody said anything
+    about it. Where `cleared` holds of a cell's centre (m, in the frame) the cell is taken for free. Raises ValueError
+    for a box that is empty, not finite or too large.
     """
 
     def all_cells(mask: Callable[[Hypotheses], Bool[np.ndarray, "V"]]) -> Int[np.ndarray, "n 3"]:
@@ -109,7 +109,7 @@ def distance_field(
         low, high = (np.asarray(corner, np.float64) / width for corner in box)
         if not (np.isfinite([low, high]).all() and (low < high).all() and np.abs([low, high]).max() < 1e9):
             raise ValueError(f"the box {[np.asarray(corner).tolist() for corner in box]} is empty or not finite")
-        first, last = np.floor(low + 1e-6).astype(np.int64), np.ceil(high - 1e-6).astype(np.int64) - 1
+        first, last = (np.floor(corner + 1e-6).astype(np.int64) for corner in (low, high))
     known = known[np.all((known >= first) & (known <= last), axis=1)]
     distance = np.full(_count(first, last), np.nan, np.float32)
     if len(known):  # distances are worked out where there are objects alone

@@ -143,7 +143,10 @@ def test_distances_are_laid_out_as_nvblox_lays_them() -> None:
     corner = np.array([message.origin_m.x, message.origin_m.y, message.origin_m.z])
     np.testing.assert_allclose(corner, field.first * 0.01)
     inside = np.floor((h.object_frame.T_camera_object[:3, 3] - corner) / 0.01).astype(int)
-    assert values[tuple(inside)] == pytest.approx(-0.04, abs=0.01)  # the body's middle
+    assert values[tuple(inside)] == pytest.approx(-0.035, abs=0.01)  # the body's middle
+    border = values[(values > -0.003) & (values < 0.005)]
+    assert len(border) > 100 and np.abs(border).max() < 1e-6  # the outermost voxels of what is occupied
+    assert values[values > 0.005].min() == pytest.approx(0.01)  # and those beside them
 
 
 @pytest.mark.parametrize("wrong", [{"risk": 0.0}, {"risk": 1.0}, {"mesh_grid": 2}, {"octomap_m": 0.0}])

@@ -101,8 +101,8 @@ def test_a_part_of_the_field_is_that_of_the_whole() -> None:
     first = whole.first + np.array([4, 5, 6])
     low = first * 0.01
     part = distance_field([h], np.eye(4), (low + 0.004, low + np.array([0.056, 0.05, 0.034])), 0.05, 0.01)
-    assert part.distance.shape == (6, 5, 4) and np.array_equal(part.first, first)
-    np.testing.assert_array_equal(part.distance, whole.distance[4:10, 5:10, 6:10])
+    assert part.distance.shape == (6, 6, 4) and np.array_equal(part.first, first)
+    np.testing.assert_array_equal(part.distance, whole.distance[4:10, 5:11, 6:10])
     beyond = distance_field([h], np.eye(4), ((5.0, 5.0, 5.0), (5.1, 5.1, 5.1)), 0.05, 0.01)
     assert np.isnan(beyond.distance).all()
 
