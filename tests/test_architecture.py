@@ -123,6 +123,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "igl": ("probnerf/objects/mesh.py", "benchmarks/scenes/strangers.py"),  # generalised winding numbers
     "embreex": ("perception/simulation/ray_caster.py",),  # the extra `meshes`, imported where it is needed
     "manifold3d": ("probnerf/objects/household_parts.py",),  # the same extra: exact booleans of solids
+    "ompl": ("examples/05_ompl_planner.py",),  # the extra `planners`, imported where it is needed
     "rich": ("node/*", "benchmarks/*"),
     "PIL": ("node/figures/turning.py",),  # GIF
     "matplotlib": ("calibration/print_board.py", "node/figures/*", "benchmarks/*"),

@@ -10,7 +10,7 @@ import pytest
 import farside
 from farside import api
 from node.ros.bus import Bus
-from node.ros.messages import QUERY_REGION
+from node.ros.messages import HYPOTHESES, QUERY_REGION, hypotheses_message
 from node.ros.services import Answers
 from node.ros.settings import BusConfig
 from tests.node.mugs import mug_hypotheses, table_frame
@@ -72,3 +72,25 @@ def test_reach_planner_takes_a_way_that_is_free_enough_and_no_doubtful_one(
             assert "free with 0.30" in output and "no way is free enough" in output
             main((-0.07, 0.0, 0.0), least=0.25, **source)
             assert "taken: from" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("source", ["file", "node"])
+def test_ompl_plans_where_shapes_are_known(example: Callable, tmp_path: Path, source: str) -> None:
+    """In unseen space: a goal clear of both handles that there may be, and one in the body, whose back nobody saw."""
+    pytest.importorskip("ompl")
+    h, main, endpoint = body_with_handle(), example("05_ompl_planner"), f"tcp/127.0.0.1:{free_port()}"
+    with Bus(BusConfig(name="farside", listen=(endpoint,))) as bus:
+        publisher = bus.publisher("~/hypotheses", HYPOTHESES, latched=True, depth=8)
+        publisher.publish(hypotheses_message(h))
+        where = {"file": farside.save(tmp_path, h)[0]} if source == "file" else {"connect": endpoint}
+        answers = main((0.0, -0.3, 0.0), (0.0, 0.1, 0.0), **where)
+        inside = main((0.0, 0.3, 0.0), (0.0, 0.025, 0.0), seconds=1.0, **where)
+    assert answers["Farside"].p_free == 1.0 and answers["unknown is occupied"] is None
+    assert inside["unknown is free"].p_free == 0.0 and inside["Farside"] is None
+
+
+def test_ompl_planner_says_what_it_needs(example: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (file,) = farside.save(tmp_path, body_with_handle())
+    monkeypatch.setitem(sys.modules, "ompl", None)
+    with pytest.raises(SystemExit, match="OMPL is not installed; this example needs it: pip install ompl"):
+        example("05_ompl_planner")((0.0, -0.3, 0.0), (0.0, 0.1, 0.0), file=file)
