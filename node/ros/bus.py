@@ -1,8 +1,8 @@
 """The bus: topics and services of ROS 2 on Zenoh, in the format of `rmw_zenoh_cpp` (`rmw_zenoh.py`), without ROS.
 
 Closed by default: it listens on this machine alone, does not search by multicast, and connects only to configured
-endpoints. Incoming messages are bounded in size, rate and queue length. Faulty ones are counted, reported once, and
-skipped.
+endpoints. Incoming messages are bounded in size, and for each sender in rate and queue length (`fair_queue.py`), so
+that one that floods a topic or service keeps no other out. Faulty messages are counted, reported once, and skipped.
 """
 
 import json
@@ -19,13 +19,13 @@ import zenoh
 import zenoh.ext
 
 from foundation.one_line import one_line
+from node.ros.incoming import Incoming, read_tag
 from node.ros.message_counts import MessageCounts, Rate
 from node.ros.messages import decode, encode, make, type_hash
-from node.ros.rmw_zenoh import RosNode, attachment, gid, key, quality, read_attachment
+from node.ros.rmw_zenoh import RosNode, attachment, gid, key, quality
 from node.ros.settings import BusConfig
 
 _HEARTBEAT_S = 0.5  # lets a late subscriber notice that it missed a latched sample; as in rmw_zenoh_cpp
-_SENDERS = 256  # whose sequence numbers are remembered
 
 
 @dataclass
@@ -87,7 +87,6 @@ class Bus:
         self.counts = MessageCounts(say or (lambda line: print(f"farside: {line}", file=sys.stderr)))
         self._entities = 0
         self._tokens: list[str] = []  # our own, which a router does not report to us
-        self._threads: list[threading.Thread] = []
         self._clients: dict[tuple[str, str], bytes] = {}
         self._sequence = 0
         self._lock = threading.Lock()
@@ -104,10 +103,7 @@ class Bus:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._stack.close()  # ends the loops of the threads, too
-        for thread in self._threads:
-            if thread is not threading.current_thread():
-                thread.join(5.0)
+        self._stack.close()  # ends the threads, too
 
     def publisher(self, name: str, kind: str, *, latched: bool = False, depth: int = 1) -> Publisher:
         """A topic to publish on. `latched` (TRANSIENT_LOCAL): late subscribers get the last `depth` messages."""
@@ -133,38 +129,38 @@ class Bus:
     ) -> str:
         """Call `handler` with each message, in a thread of this subscription's own. Returns the full name.
 
-        While it works, the newest `depth` messages wait and older ones are dropped. `latched`: the last messages sent
-        before come first.
+        While it works, the newest `depth` messages of each sender wait and older ones are dropped. `latched`: the last
+        messages sent before come first.
         """
         name, where, _ = self._entity("MS", name, kind, quality(depth, latched))
-        ring: Any = zenoh.handlers.RingChannel(depth)
+
+        def take(sample: Any, _: tuple[int, bytes]) -> None:
+            handler(decode(sample.payload.to_bytes(), kind))
+
+        arrived = self._handle(name, depth, take)
         if latched:
             subscriber: Any = zenoh.ext.declare_advanced_subscriber(
                 self._session,
                 where,
-                ring,
+                arrived,
                 history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=depth),
                 recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
                 subscriber_detection=True,
             )
         else:
-            subscriber = self._session.declare_subscriber(where, ring)
-
-        def take(sample: Any, _: tuple[int, bytes]) -> None:
-            handler(decode(sample.payload.to_bytes(), kind))
-
-        self._run(name, subscriber, take)
+            subscriber = self._session.declare_subscriber(where, arrived)
+        self._stack.callback(subscriber.undeclare)
         return name
 
     def serve(self, name: str, kind: str, handler: Callable[[Any], Any], *, depth: int = 10) -> str:
         """Answer a service's requests with `handler`, one at a time in a thread of its own. Returns the full name.
 
+        The newest `depth` requests of each client wait; the clients take turns.
         An error in `handler` becomes a response with success = false, and the error's line as message, as far as the
         type has these.
         """
         name, where, _ = self._entity("SS", name, kind, quality(depth))
         own = vars(make(f"{kind}_Response"))
-        queryable = self._session.declare_queryable(where, zenoh.handlers.RingChannel(depth), complete=True)
 
         def answer(query: Any, tag: tuple[int, bytes], response: Any) -> None:
             data = encode(response)
@@ -182,11 +178,12 @@ class Bus:
             try:
                 if "success" not in told:
                     raise ValueError
-                answer(query, _tag(query), make(f"{kind}_Response", **told))
+                answer(query, read_tag(query), make(f"{kind}_Response", **told))
             except ValueError:  # its response cannot say so, or the query has no sender
                 query.reply_err(trouble.encode())
 
-        self._run(name, queryable, take, refuse)
+        arrived = self._handle(name, depth, take, refuse)
+        self._stack.callback(self._session.declare_queryable(where, arrived, complete=True).undeclare)
         return name
 
     def call(self, name: str, kind: str, request: Any, timeout_s: float = 5.0) -> Any:
@@ -240,50 +237,11 @@ class Bus:
         self._declare(token)
         return name, key(self.config.domain_id, name, kind, hashed), gid(token)
 
-    def _run(self, name: str, source: Any, take: Callable, refuse: Callable | None = None) -> None:
-        """Handle what comes from `source` in a thread, until it is undeclared; `refuse` answers a faulty query."""
-        rate, last, c = Rate(self.config.max_rate), dict[bytes, int](), self.config
-        setting, limit = (
-            ("max_request_bytes", c.max_request_bytes) if refuse else ("max_message_bytes", c.max_message_bytes)
-        )
-
-        def judge(item: Any) -> tuple[str, str]:
-            """The fate of one item, and what was wrong with it."""
-            try:
-                sequence, sender = tag = _tag(item)
-                if lost := max(0, sequence - last.get(sender, sequence) - 1):
-                    self.counts.add(name, "dropped", count=lost)
-                if len(last) > _SENDERS:
-                    last.clear()
-                last[sender] = max(sequence, last.get(sender, sequence))
-                size = len(item.payload) if item.payload is not None else 0
-                if size > limit:
-                    return "too_large", f"a message of {size} bytes is larger than {setting} ({limit})"
-                if not rate.allows():
-                    return "too_fast", f"messages come faster than max_rate ({self.config.max_rate:g} Hz)"
-                take(item, tag)
-            except ValueError as error:
-                return "refused" if refuse else "malformed", one_line(error)
-            except Exception as error:  # an error in a handler must not end the service
-                return "failed", f"{type(error).__name__}: {one_line(error)}"
-            return "received", ""
-
-        def loop() -> None:
-            for item in source:
-                fate, trouble = judge(item)
-                self.counts.add(name, fate, trouble)
-                if refuse:
-                    try:
-                        if trouble:
-                            refuse(item, trouble)
-                        item.drop()  # now, not when it is collected: the asker waits for the end of answers
-                    except zenoh.ZError as error:  # the client is gone
-                        self.counts.add(name, "failed", one_line(error))
-
-        thread = threading.Thread(target=loop, name=f"bus {name}", daemon=True)
-        thread.start()
-        self._stack.callback(source.undeclare)
-        self._threads.append(thread)
+    def _handle(self, name: str, depth: int, take: Callable, refuse: Callable | None = None) -> zenoh.handlers.Callback:
+        """Where zenoh puts what comes: a thread handles it until the bus ends; `refuse` answers a faulty query."""
+        incoming = Incoming(name, depth, self.config, self.counts, take, refuse)
+        self._stack.callback(incoming.close)
+        return zenoh.handlers.Callback(incoming.arrive, indirect=False)
 
 
 def _open(config: BusConfig) -> zenoh.Session:
@@ -301,11 +259,3 @@ def _open(config: BusConfig) -> zenoh.Session:
         reason = text.split(" at /")[0].strip()
         listen, connect = ", ".join(config.listen) or "nothing", ", ".join(config.connect) or "nothing"
         raise OSError(f"the bus cannot open (listen {listen}; connect {connect}): {' '.join(reason.split())}") from None
-
-
-def _tag(item: Any) -> tuple[int, bytes]:
-    """Number and sender of a sample or query. Raises ValueError if it carries none."""
-    if item.attachment is None:
-        raise ValueError("a message has no attachment; its sender does not speak as rmw_zenoh_cpp does")
-    sequence, _, sender = read_attachment(item.attachment.to_bytes())
-    return sequence, sender
