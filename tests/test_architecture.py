@@ -102,7 +102,12 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "serial": ("calibration/turntable.py",),
     "depthai": ("perception/sources/oak.py",),
     # recorded logs; messages on the bus
-    "rosbags": ("perception/sources/log_messages.py", "perception/sources/recorder.py", "node/ros/messages.py"),
+    "rosbags": (
+        "perception/sources/log_messages.py",
+        "perception/sources/recorder.py",
+        "node/ros/messages.py",
+        "node/ros/type_descriptions.py",
+    ),
     "mcap": ("perception/sources/log_messages.py", "perception/sources/recorder.py"),
     "yaml": ("calibration/camera_file.py",),  # camera files, which ROS writes as YAML 1.1
     # launch files: YAML 1.2 (1e-3 is a number), no key twice; then into dataclasses

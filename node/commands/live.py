@@ -24,6 +24,7 @@ from node.ros.publishers import Announcer
 from node.ros.scene_messages import DiagnosticStatus, Level
 from node.ros.services import Answers
 from node.ros.topic_source import TopicSource
+from node.ros.type_descriptions import serve_type_descriptions
 from perception.answers.hypotheses import Hypotheses
 from perception.inference.inference import Inference
 from perception.inference.limits import Callbacks, Limits
@@ -85,6 +86,7 @@ def live(config: LiveConfig, out: Console, err: Console) -> None:
         node = LiveNode(config, tracker, announcer, answers, reader, keeper, recorder, err)
         answers.serve(bus)
         serve_parameters(bus, flat(config) | {"use_sim_time": config.bus.use_sim_time})
+        serve_type_descriptions(bus)
         if page is not None:
             node.show = page.show
             out.print(f"{page.address} shows it", highlight=False, soft_wrap=True)

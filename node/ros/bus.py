@@ -40,6 +40,7 @@ class Publisher:
     _counts: MessageCounts
     _rate: Rate
     _max_bytes: int
+    close: Callable[[], None]  # once: what is latched is no longer there for late subscribers
     _sequence: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -86,7 +87,8 @@ class Bus:
         self.config = config or BusConfig()
         self.counts = MessageCounts(say or (lambda line: print(f"farside: {line}", file=sys.stderr)))
         self._entities = 0
-        self._tokens: list[str] = []  # our own, which a router does not report to us
+        self._tokens: dict[str, Any] = {}  # our own, which a router does not report to us
+        self._publishers: dict[str, Any] = {}  # by token
         self._clients: dict[tuple[str, str], bytes] = {}
         self._sequence = 0
         self._lock = threading.Lock()
@@ -107,7 +109,7 @@ class Bus:
 
     def publisher(self, name: str, kind: str, *, latched: bool = False, depth: int = 1) -> Publisher:
         """A topic to publish on. `latched` (TRANSIENT_LOCAL): late subscribers get the last `depth` messages."""
-        name, where, source = self._entity("MP", name, kind, quality(depth, latched))
+        name, where, token = self._entity("MP", name, kind, quality(depth, latched))
         drop = zenoh.CongestionControl.DROP  # rather than wait for a slow subscriber
         if latched:
             publisher: Any = zenoh.ext.declare_advanced_publisher(
@@ -120,9 +122,16 @@ class Bus:
             )
         else:
             publisher = self._session.declare_publisher(where, congestion_control=drop)
-        self._stack.callback(publisher.undeclare)
-        c = self.config
-        return Publisher(name, kind, latched, publisher, source, self.counts, Rate(c.max_rate), c.max_message_bytes)
+
+        self._publishers[token] = publisher  # or zenoh ends it
+
+        def close() -> None:
+            self._publishers.pop(token).undeclare()
+            self._tokens.pop(token).undeclare()
+
+        c, source = self.config, gid(token)
+        rate = Rate(c.max_rate)
+        return Publisher(name, kind, latched, publisher, source, self.counts, rate, c.max_message_bytes, close)
 
     def subscribe(
         self, name: str, kind: str, handler: Callable[[Any], object], *, latched: bool = False, depth: int = 5
@@ -194,7 +203,7 @@ class Bus:
         name = self.node.resolve(name)
         with self._lock:
             if (name, kind) not in self._clients:
-                self._clients[name, kind] = self._entity("SC", name, kind, quality(10))[2]
+                self._clients[name, kind] = gid(self._entity("SC", name, kind, quality(10))[2])
             source = self._clients[name, kind]
             self._sequence += 1
             sequence = self._sequence
@@ -226,16 +235,15 @@ class Bus:
         return sorted({*self._tokens, *(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)})
 
     def _declare(self, token: str) -> None:
-        self._stack.enter_context(self._session.liveliness().declare_token(token))
-        self._tokens.append(token)
+        self._tokens[token] = self._session.liveliness().declare_token(token)
 
-    def _entity(self, code: str, name: str, kind: str, qos: str) -> tuple[str, str, bytes]:
-        """Announce a publisher, subscriber, service or client: its full name, key and gid."""
+    def _entity(self, code: str, name: str, kind: str, qos: str) -> tuple[str, str, str]:
+        """Announce a publisher, subscriber, service or client: its full name, key and token."""
         name, hashed = self.node.resolve(name), type_hash(kind)
         self._entities += 1
         token = self.node.token(self._entities, code, name, kind, hashed, qos)
         self._declare(token)
-        return name, key(self.config.domain_id, name, kind, hashed), gid(token)
+        return name, key(self.config.domain_id, name, kind, hashed), token
 
     def _handle(self, name: str, depth: int, take: Callable, refuse: Callable | None = None) -> zenoh.handlers.Callback:
         """Where zenoh puts what comes: a thread handles it until the bus ends; `refuse` answers a faulty query."""

@@ -66,6 +66,15 @@ SERVICES = {
     "rcl_interfaces/srv/SetParameters": (
         "rcl_interfaces/Parameter[] parameters\n---\nrcl_interfaces/SetParametersResult[] results\n"
     ),
+    "rcl_interfaces/srv/SetParametersAtomically": (
+        "rcl_interfaces/Parameter[] parameters\n---\nrcl_interfaces/SetParametersResult result\n"
+    ),
+    "type_description_interfaces/srv/GetTypeDescription": (
+        "string type_name\nstring type_hash\nbool include_type_sources true\n---\n"
+        "bool successful\nstring failure_reason\ntype_description_interfaces/TypeDescription type_description\n"
+        "type_description_interfaces/TypeSource[] type_sources\n"
+        "type_description_interfaces/KeyValue[] extra_information\n"
+    ),
     # Isaac ROS 4 (Jazzy); in 3.2 (Humble) the response has no header
     "nvblox_msgs/srv/EsdfAndGradients": (
         "bool update_esdf\nbool visualize_esdf\nbool use_aabb\nstring frame_id\n"

@@ -57,10 +57,8 @@ def serve_parameters(bus: Bus, parameters: Mapping[str, Parameter]) -> None:
             ],
         )
 
-    def refused(request: Any) -> Any:
-        reason = "the node's settings are read when it starts; change its configuration file"
-        result = make(_kind("SetParametersResult"), successful=False, reason=reason)
-        return reply("SetParameters", results=[result] * len(request.parameters))
+    reason = "the node's settings are read when it starts; change its configuration file"
+    refusal = make(_kind("SetParametersResult"), successful=False, reason=reason)
 
     handlers = {
         "GetParameters": lambda r: reply("GetParameters", values=[_value(parameters.get(n)) for n in r.names]),
@@ -69,7 +67,8 @@ def serve_parameters(bus: Bus, parameters: Mapping[str, Parameter]) -> None:
         ),
         "ListParameters": listed,
         "DescribeParameters": described,
-        "SetParameters": refused,
+        "SetParameters": lambda r: reply("SetParameters", results=[refusal] * len(r.parameters)),
+        "SetParametersAtomically": lambda r: reply("SetParametersAtomically", result=refusal),
     }
     for service, handler in handlers.items():
         snake = "".join(f"_{c.lower()}" if c.isupper() else c for c in service).strip("_")

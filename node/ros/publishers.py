@@ -29,7 +29,6 @@ from perception.answers.hypotheses import Hypotheses
 from perception.sources.frame import Frame
 
 _CAMERA = {"color/image_raw": "Image", "color/camera_info": "CameraInfo", "depth/image_raw": "Image"}
-LATCHED = 8  # objects whose hypotheses a late subscriber gets
 
 
 class Announcer:
@@ -41,7 +40,8 @@ class Announcer:
     def __init__(self, bus: Bus, planner: PlannerConfig | None = None, clock: Clock | None = None) -> None:
         self._bus, self._planner, self._clock = bus, planner or PlannerConfig(), clock or Clock()
         self._node = bus.node.resolve("~/object").removesuffix("/object")
-        self._hypotheses = bus.publisher("~/hypotheses", HYPOTHESES, latched=True, depth=LATCHED)
+        # One of each object: a late subscriber gets the last answer of each that is there, and no earlier one.
+        self._hypotheses: dict[int, Publisher] = {}
         self._occupancy = bus.publisher("~/occupancy", "sensor_msgs/msg/PointCloud2")
         self._markers = bus.publisher("~/markers", "visualization_msgs/msg/MarkerArray")
         self._uncertainty = bus.publisher("~/uncertainty", "sensor_msgs/msg/Image")
@@ -67,8 +67,12 @@ class Announcer:
 
     def scene(self, objects: Sequence[Hypotheses], camera: Camera, method: str = "") -> None:
         """Publish everything about one scene. `camera` is that of the picture."""
+        for gone in self._hypotheses.keys() - {h.object_id for h in objects}:
+            self._hypotheses.pop(gone).close()
         for h in objects:
-            self._hypotheses.publish(hypotheses_message(h, method))
+            if h.object_id not in self._hypotheses:
+                self._hypotheses[h.object_id] = self._bus.publisher("~/hypotheses", HYPOTHESES, latched=True)
+            self._hypotheses[h.object_id].publish(hypotheses_message(h, method))
         self._plan(objects)
         if not objects:
             return

@@ -50,9 +50,20 @@ def test_hashes_known_from_ros() -> None:
     assert type_hash(ADD) == "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"
     string = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
     assert type_hash("std_msgs/msg/String") == string
-    get = "RIHS01_bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc"
-    assert type_hash("rcl_interfaces/srv/GetParameters") == get
-    for kind, digest in BUILT.items():
+    services = {
+        "rcl_interfaces/srv/GetParameters": "bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc",
+        "rcl_interfaces/srv/GetParameterTypes": "da199c878688b3e530bdfe3ca8f74cb9fa0c303101e980a9e8f260e25e1c80ca",
+        "rcl_interfaces/srv/ListParameters": "3e6062bfbb27bfb8730d4cef2558221f51a11646d78e7bb30a1e83afac3aad9d",
+        "rcl_interfaces/srv/DescribeParameters": "845b484d71eb0673dae682f2e3ba3c4851a65a3dcfb97bddd82c5b57e91e4cff",
+        "rcl_interfaces/srv/SetParameters": "56eed9a67e169f9cb6c1f987bc88f868c14a8fc9f743a263bc734c154015d7e0",
+        "rcl_interfaces/srv/SetParametersAtomically": (
+            "0e192ef259c07fc3c07a13191d27002222e65e00ccec653ca05e856f79285fcd"
+        ),
+        "type_description_interfaces/srv/GetTypeDescription": (
+            "69b9c19c1021405984cc60dbbb1edceb147a6538b411d812ba6afabeed962cd5"
+        ),
+    }
+    for kind, digest in (BUILT | services).items():
         assert type_hash(kind) == f"RIHS01_{digest}"
     with pytest.raises(ValueError, match="the type 'std_msgs/msg/Strin' is unknown"):
         type_hash("std_msgs/msg/Strin")

@@ -1,5 +1,7 @@
 """Services answer with what the functions behind them say, of one scene at a time, and refuse in one line."""
 
+import hashlib
+import json
 import sys
 import threading
 import time
@@ -11,10 +13,21 @@ import numpy as np
 import pytest
 
 from node.ros.bus import Bus
-from node.ros.messages import NEXT_VIEW, QUERY_REGION, header, make, matrix, pose
+from node.ros.messages import (
+    FOLDER,
+    HYPOTHESES,
+    NEXT_VIEW,
+    QUERY_REGION,
+    header,
+    make,
+    matrix,
+    pose,
+    type_hash,
+)
 from node.ros.parameters import flat, serve_parameters
 from node.ros.services import BOX, POINTS, SWEPT, Answers
 from node.ros.settings import BusConfig
+from node.ros.type_descriptions import GET_TYPE_DESCRIPTION, description, serve_type_descriptions
 from perception.answers.query import query
 from perception.answers.regions import Box, Points
 from probnerf.geometry import look_at
@@ -230,6 +243,34 @@ def test_over_the_bus_while_scenes_change() -> None:
         assert not refused.success and refused.message.startswith("frame_id is 'map'")
 
 
+def test_a_type_is_described_as_it_is_hashed() -> None:
+    """What a client rebuilds from the answer has the very hash of the type; own types come with their text."""
+    for kind in (HYPOTHESES, QUERY_REGION, "std_msgs/msg/Empty", "rcl_interfaces/msg/ParameterDescriptor"):
+        digest = hashlib.sha256(json.dumps(description(kind)).encode()).hexdigest()
+        assert f"RIHS01_{digest}" == type_hash(kind)
+
+    def call(bus: Bus, name: str, hashed: str) -> Any:
+        request = make(f"{GET_TYPE_DESCRIPTION}_Request", type_name=name, type_hash=hashed, include_type_sources=True)
+        return bus.call("~/get_type_description", GET_TYPE_DESCRIPTION, request, 20.0)
+
+    with Bus(BusConfig()) as bus:
+        serve_type_descriptions(bus)
+        answer = call(bus, HYPOTHESES, type_hash(HYPOTHESES))
+        described = answer.type_description
+        assert answer.successful and described.type_description.type_name == HYPOTHESES
+        names = [f.name for f in described.type_description.fields]
+        assert names == [f["name"] for f in description(HYPOTHESES)["type_description"]["fields"]]
+        header = next(f.type for f in described.type_description.fields if f.name == "header")
+        assert (header.type_id, header.nested_type_name) == (1, "std_msgs/msg/Header")
+        assert "std_msgs/msg/Header" in {part.type_name for part in described.referenced_type_descriptions}
+        (source,) = answer.type_sources
+        assert source.raw_file_contents == (FOLDER / "msg" / "ShapeHypotheses.msg").read_text()
+        wrong = call(bus, HYPOTHESES, "RIHS01_00")
+        assert not wrong.successful and "two versions of it are in use" in wrong.failure_reason
+        unknown = call(bus, "a_msgs/msg/B", "")
+        assert not unknown.successful and "'a_msgs/msg/B' is unknown" in unknown.failure_reason
+
+
 def test_settings_are_parameters() -> None:
     config = BusConfig(domain_id=3)
     assert flat(config)["domain_id"] == 3 and "tls_ca" not in flat(config)
@@ -251,4 +292,7 @@ def test_settings_are_parameters() -> None:
         assert call(bus, "GetParameterTypes", names=["gate"]).types.tolist() == [3]
         described = call(bus, "DescribeParameters", names=["seed"]).descriptors[0]
         assert (described.name, described.type, described.read_only) == ("seed", 2, True)
-        assert not call(bus, "SetParameters", parameters=[make("rcl_interfaces/msg/Parameter")]).results[0].successful
+        wanted = {"parameters": [make("rcl_interfaces/msg/Parameter")]}
+        assert not call(bus, "SetParameters", **wanted).results[0].successful
+        result = call(bus, "SetParametersAtomically", **wanted).result
+        assert not result.successful and "change its configuration file" in result.reason
