@@ -9,9 +9,10 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from itertools import product
 from types import TracebackType
 from typing import Any, Self
 
@@ -22,10 +23,11 @@ from foundation.one_line import one_line
 from node.ros.incoming import Incoming, read_tag
 from node.ros.message_counts import MessageCounts, Rate
 from node.ros.messages import decode, encode, make, type_hash
-from node.ros.rmw_zenoh import RosNode, attachment, gid, key, quality
+from node.ros.rmw_zenoh import Entity, RosNode, attachment, entity, gid, key, quality, why_apart
 from node.ros.settings import BusConfig
 
 _HEARTBEAT_S = 0.5  # lets a late subscriber notice that it missed a latched sample; as in rmw_zenoh_cpp
+_OTHERS = 4096  # entities of other nodes that are compared with our own
 
 
 @dataclass
@@ -89,6 +91,8 @@ class Bus:
         self._entities = 0
         self._tokens: dict[str, Any] = {}  # our own, which a router does not report to us
         self._publishers: dict[str, Any] = {}  # by token
+        self._meeting = threading.Lock()  # of who is there; held for moments, as zenoh's own threads take it
+        self._others: dict[str, Entity] = {}  # of other nodes, by token
         self._clients: dict[tuple[str, str], bytes] = {}
         self._sequence = 0
         self._lock = threading.Lock()
@@ -100,6 +104,9 @@ class Bus:
             self.node = RosNode(c.domain_id, str(self._session.zid()), c.namespace, c.name)
             self._stack = stack.pop_all()
         self._declare(self.node.token(0, "NN"))
+        where, met = f"@ros2_lv/{c.domain_id}/**", zenoh.handlers.Callback(self._meet, indirect=False)
+        others = self._session.liveliness().declare_subscriber(where, met, history=True)
+        self._stack.callback(others.undeclare)
         return self
 
     def __exit__(
@@ -236,6 +243,31 @@ class Bus:
 
     def _declare(self, token: str) -> None:
         self._tokens[token] = self._session.liveliness().declare_token(token)
+        with self._meeting:
+            others = list(self._others.values())
+        self._compare([entity(token)], others)
+
+    def _meet(self, sample: Any) -> None:
+        """An entity of another node has come, or is gone."""
+        token = str(sample.key_expr)
+        other = entity(token)
+        if other is None or other.zid == self.node.zid:
+            return
+        with self._meeting:
+            if sample.kind == zenoh.SampleKind.DELETE:
+                self._others.pop(token, None)
+                return
+            if len(self._others) >= _OTHERS:
+                return
+            self._others[token] = other
+            mine = [entity(token) for token in tuple(self._tokens)]
+        self._compare(mine, [other])
+
+    def _compare(self, mine: Sequence[Entity | None], others: Sequence[Entity]) -> None:
+        """Say which others never hear ours, for their type has another hash."""
+        for own, other in product(mine, others):
+            if own is not None and (why := why_apart(own, other)):
+                self.counts.add(own.topic, "other_type", why)
 
     def _entity(self, code: str, name: str, kind: str, qos: str) -> tuple[str, str, str]:
         """Announce a publisher, subscriber, service or client: its full name, key and token."""

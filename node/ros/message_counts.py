@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 
 class MessageCounts:
-    """Counts of messages by topic or service and fate: sent, received, dropped, too_large, too_fast, malformed, failed.
+    """Counts of messages by topic or service and fate: sent, received, dropped, too_large, too_fast, malformed, failed,
+    refused, other_type.
     The first fault of each kind is reported in a line.
     """
 

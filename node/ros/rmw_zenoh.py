@@ -8,6 +8,8 @@ import xxhash
 
 _NAME = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 _ATTACHMENT = struct.Struct("<qqB16s")
+_PARTNERS = {"MP": "MS", "MS": "MP", "SS": "SC", "SC": "SS"}
+_NO_HASH = "TypeHashNotSupported"
 _DEFAULT_DEPTH = 42  # of rmw_zenoh_cpp's default quality of service, which is left out
 
 
@@ -34,6 +36,48 @@ class RosNode:
         who = [_mangled(self.namespace), self.name]
         what = [_mangled(topic), type_name(kind), type_hash, qos] if topic else []
         return "/".join(["@ros2_lv", str(self.domain), self.zid, "0", str(entity), code, "%", *who, *what])
+
+
+@dataclass(frozen=True)
+class Entity:
+    """What a liveliness token says of a publisher, subscriber, service or client."""
+
+    zid: str
+    code: str
+    node: str  # full name
+    topic: str
+    kind: str  # as type_name gives it
+    type_hash: str
+
+    @property
+    def meets(self) -> tuple[str, str, str]:
+        """Whom it exchanges messages with, if their hash is the same: their code, topic and type."""
+        return _PARTNERS[self.code], self.topic, self.kind
+
+
+def entity(token: str) -> Entity | None:
+    """The entity of a token; None for that of a node, and for what is no token."""
+    parts = token.split("/")
+    if len(parts) < 13 or parts[5] not in _PARTNERS:
+        return None
+    space, node, topic = (part.replace("%", "/") for part in parts[7:10])
+    return Entity(parts[2], parts[5], f"{space.rstrip('/')}/{node}", topic, parts[10], parts[11])
+
+
+def why_apart(mine: Entity, other: Entity) -> str | None:
+    """Why two entities do not hear each other although topic and type are the same. None: they do, or never would."""
+    if mine.meets != (other.code, other.topic, other.kind) or mine.type_hash == other.type_hash:
+        return None
+    who, kind = f"node {other.node}", mine.kind.replace("::dds_::", "::").replace("::", "/").removesuffix("_")
+    if other.type_hash == _NO_HASH:
+        return (
+            f"{who} has no hash of {kind}, as nodes of ROS 2 Humble, and neither hears the other;"
+            " run it on ROS 2 Jazzy or newer"
+        )
+    return (
+        f"{who} has another definition of {kind} ({other.type_hash[:15]}, here {mine.type_hash[:15]}), and neither"
+        " hears the other; build both with the same version of the package"
+    )
 
 
 def key(domain: int, name: str, kind: str, type_hash: str) -> str:

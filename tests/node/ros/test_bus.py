@@ -264,6 +264,38 @@ def test_nodes_meet_at_a_router(mode: str) -> None:
                 assert until(lambda: nodes <= set(other.graph())), nodes - set(other.graph())
 
 
+@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize(
+    ("hashed", "why"),
+    [
+        ("TypeHashNotSupported", "has no hash of std_msgs/msg/String, as nodes of ROS 2 Humble"),
+        (
+            "RIHS01_0123456789abcdef",
+            "has another definition of std_msgs/msg/String (RIHS01_01234567, here",
+        ),
+        (type_hash(TEXT), ""),
+    ],
+)
+def test_who_cannot_be_heard_is_named(said: list[str], hashed: str, why: str, first: bool) -> None:
+    """A peer with another hash of our type would never be heard; whoever comes first, it is said once."""
+    here = f"tcp/127.0.0.1:{free_port()}"
+    with Bus(BusConfig(listen=(here,)), said.append) as bus, Bus(BusConfig(name="x", connect=(here,))) as other:
+        driver = RosNode(0, str(other._session.zid()), "/robot", "driver")
+        if not first:
+            bus.subscribe("/words", TEXT, print)
+        codes = ("MP", "MP", "MS")  # a subscriber's definition does not matter to a subscriber
+        for number, code in enumerate(codes, 9):
+            other._declare(driver.token(number, code, "/words", TEXT, hashed, "::,7:,:,:,,"))
+        assert until(lambda: len(bus._others) == 3)
+        if first:
+            bus.subscribe("/words", TEXT, print)
+        assert bus.counts.of("/words").get("other_type", 0) == (2 if why else 0)
+        for token in [token for token in other._tokens if "/driver/" in token]:
+            other._tokens.pop(token).undeclare()
+        assert until(lambda: not bus._others)
+    assert len(said) == bool(why) and all(f"/words: node /robot/driver {why}" in line for line in said)
+
+
 def certificates(folder: Path, *names: str) -> None:
     """A certificate authority ca.pem, and NAME.pem with NAME.key that it signed, for 127.0.0.1."""
 
