@@ -17,6 +17,7 @@ from typing import NoReturn, TypeVar
 import tyro
 from rich.console import Console
 
+from node.commands.batch_options import BatchConfig
 from node.commands.options import (
     Calibrate,
     Capture,
@@ -31,7 +32,7 @@ from node.commands.options import (
 from node.commands.training_options import NetworkTraining, Training
 from probnerf.environment import prepare
 
-Config = TypeVar("Config", ReplayConfig, Segmenting, LiveConfig)
+Config = TypeVar("Config", ReplayConfig, Segmenting, LiveConfig, BatchConfig)
 
 DESCRIPTION = """Farside: from one partial RGB-D view of an object, several whole, weighted shapes, and the probability
 that any space the camera cannot see is occupied. Lengths are in metres. --version prints the version; with --debug an
@@ -42,6 +43,7 @@ SUMMARIES = {
     "replay": str(ReplayConfig.__doc__),
     "segment": str(Segmenting.__doc__),
     "live": str(LiveConfig.__doc__),
+    "batch": str(BatchConfig.__doc__).split("\n")[0],
     "record": str(Record.__doc__),
     "query": str(Query.__doc__),
     "view": str(View.__doc__),
@@ -94,6 +96,13 @@ def _live(args: Sequence[str]) -> int:
 
     live(config, Console(), Console(stderr=True))
     return 0
+
+
+def _batch(args: Sequence[str]) -> int:
+    config = _configured(BatchConfig, "farside batch", args)
+    from node.commands.batch import batch
+
+    return batch(config, Console(), Console(stderr=True))
 
 
 def _record(args: Sequence[str]) -> int:
@@ -200,6 +209,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "replay": _replay,
     "segment": _segment,
     "live": _live,
+    "batch": _batch,
     "record": _record,
     "query": _query,
     "view": _view,
@@ -212,7 +222,8 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code: 0, 1 for an error of the input, 130 after Ctrl-C.
+    """Run one command and return its exit code: 0, 1 for an error of the input, 130 after Ctrl-C, 3 where parts of a
+    batch failed.
 
     Mistyped options end the process with code 2, help with 0 (`SystemExit`). Without `argv` it is the program, and ends
     the process with the code.

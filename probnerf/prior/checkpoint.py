@@ -78,9 +78,7 @@ def load_prior(path: Path | None = None, preset: str | None = None) -> Prior:
     Raises FileNotFoundError if there is no file. Raises ValueError if it is not a prior, is damaged or has another
     preset, or if the network's file is damaged or another prior's. Messages have one line.
     """
-    path = SHIPPED if path is None else Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such prior; train one with `farside train`, or omit the option")
+    path = _prior_path(path)
     story, arrays = _read(path, "prior", "train one with `farside train`")
     if story.get("format") != FORMAT or story.get("preset") not in PRESETS:
         raise ValueError(f"{path} is not a prior of format {FORMAT} with a preset of {', '.join(PRESETS)}")
@@ -94,6 +92,13 @@ def load_prior(path: Path | None = None, preset: str | None = None) -> Prior:
         return prior
     found = load_posterior_network(beside, prior)
     return replace(prior, network=found.network, network_hash=found.hash)
+
+
+def identity_of(path: Path | None = None) -> str:
+    """`Prior.identity` of what `load_prior` would read, without its weights. Raises FileNotFoundError as it does."""
+    path = _prior_path(path)
+    beside = network_path(path)
+    return f"{_hash(path)}+{_hash(beside)}" if beside.is_file() else _hash(path)
 
 
 def save_posterior_network(path: Path, network: PosteriorNetwork, prior: str, metadata: dict[str, Any]) -> None:
@@ -198,6 +203,13 @@ def _filled(model: M, arrays: dict[str, np.ndarray], path: Path, owner: str) -> 
     # a file in half precision is read in the model's own
     leaves = jax.device_put([arrays[name].astype(leaf.dtype, copy=False) for name, leaf in named.items()])
     return jax.tree.unflatten(jax.tree.structure(model), leaves)
+
+
+def _prior_path(path: Path | None) -> Path:
+    path = SHIPPED if path is None else Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such prior; train one with `farside train`, or omit the option")
+    return path
 
 
 def _hash(path: Path) -> str:

@@ -1,6 +1,10 @@
 """Stands for inference, after the real `observe`: keeps what it was asked, answers with the true mug."""
 
+import os
+import signal
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -77,3 +81,20 @@ def pretend_live(
     monkeypatch.setattr(Tracker, "begin", begin)
     monkeypatch.setattr(Tracker, "keep", lambda self, look, found: Update(Change.NEW, found.hypotheses, 1, 0.0, 0.0))
     return asked
+
+
+def pretend_estimate(
+    frame: Frame, found: Segment, prior: Prior, config: ControllerConfig, *, seed: int, **limits: Any
+) -> Estimate:
+    """Takes the place of `estimate`, in other processes, too: the true mug, whose handle's place hangs on the seed."""
+    h = mug_hypotheses(frame, found, [1.0 + seed, -1.0], [0.75, 0.25], 16, seed=seed)
+    return Estimate(h, None, None, None, h.object_frame, 1.5)
+
+
+def deadly_estimate(frame: Frame, found: Segment, *args: Any, seed: int, **limits: Any) -> Estimate:
+    """The same; but its process is killed at object 2, as often as the folder FARSIDE_TEST_DEATHS has files."""
+    for death in Path(os.environ["FARSIDE_TEST_DEATHS"]).iterdir() if found.id == 2 else ():
+        with suppress(FileNotFoundError):  # another process died of it
+            death.unlink()
+            os.kill(os.getpid(), signal.SIGKILL)
+    return pretend_estimate(frame, found, *args, seed=seed)

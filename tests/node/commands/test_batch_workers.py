@@ -1,0 +1,101 @@
+"""`farside batch` with processes and on a Dask cluster: a worker that dies costs its unit one try, and no result."""
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import pyarrow.parquet as pq
+import pytest
+from rich.console import Console
+
+from node.__main__ import main
+from node.commands.batch import FAILED, batch
+from node.commands.batch_options import BatchConfig
+from probnerf.prior.checkpoint import save_prior
+from probnerf.prior.networks import PRESETS, ProbNeRF
+from tests.node.commands.test_batch import here
+from tests.node.commands.test_replay_whole import FEW
+from tests.node.mugs import table_frame, write_folder
+from tests.node.pretend_inference import deadly_estimate, pretend_estimate
+
+
+@pytest.fixture
+def given(tmp_path: Path) -> BatchConfig:
+    """Three logs of one frame, which has two objects."""
+    for name in "abc":
+        write_folder(tmp_path / "logs" / name, table_frame())
+    save_prior(tmp_path / "tiny.safetensors", ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {})
+    return BatchConfig(logs=(str(tmp_path / "logs"),), prior=tmp_path / "tiny.safetensors", out=str(tmp_path / "alone"))
+
+
+@pytest.fixture
+def deaths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "deaths"
+    folder.mkdir()
+    monkeypatch.setenv("FARSIDE_TEST_DEATHS", str(folder))
+    return folder
+
+
+def run(config: BatchConfig) -> tuple[int, str]:
+    text = io.StringIO()
+    code = batch(config, Console(file=text), Console(file=text), infer=deadly_estimate)
+    return code, text.getvalue()
+
+
+def test_a_killed_worker_changes_no_result(given: BatchConfig, deaths: Path, tmp_path: Path) -> None:
+    assert batch(given, Console(file=io.StringIO()), Console(file=io.StringIO()), here, pretend_estimate) == 0
+    (deaths / "1").touch()
+    code, text = run(replace(given, workers=2, out=str(tmp_path / "two")))
+    assert code == 0 and "6 units done" in text and not list(deaths.iterdir())
+    assert "object 2 seed 0: process" in text and "was ended by signal 9 (Killed); tried again" in text
+    assert (tmp_path / "two" / "table.parquet").read_bytes() == (tmp_path / "alone" / "table.parquet").read_bytes()
+
+
+def test_what_kills_every_worker_is_given_up(given: BatchConfig, deaths: Path, tmp_path: Path) -> None:
+    for n in range(3):
+        (deaths / str(n)).touch()
+    code, text = run(replace(given, logs=(f"{given.logs[0]}/a",)))
+    assert code == FAILED and "1 units done, 0 were there, 1 failed" in text and "signal 9 (Killed); given up" in text
+    alive, dead = pq.read_table(tmp_path / "alone" / "table.parquet").to_pylist()
+    assert alive["result"] == "converged" and dead["error"].startswith("given up after 3 tries: process ")
+
+
+def test_a_prior_that_cannot_be_read_ends_it_all(given: BatchConfig, capsys: pytest.CaptureFixture) -> None:
+    Path(given.prior).write_bytes(b"no weights")
+    assert main(["batch", *given.logs, "--out", given.out, "--prior", str(given.prior)]) == 1
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith("farside: error: ") and "tiny.safetensors" in line
+    assert not list(Path(given.out).rglob("object*"))
+
+
+def test_dask_loses_a_worker_and_no_result(given: BatchConfig, deaths: Path, tmp_path: Path) -> None:
+    batch(given, Console(file=io.StringIO()), Console(file=io.StringIO()), here, pretend_estimate)
+    (deaths / "1").touch()
+    code, text = run(replace(given, workers=2, dask="local", out=str(tmp_path / "dask")))
+    assert code == 0 and "2 workers; " in text and "6 units done" in text and not list(deaths.iterdir())
+    assert "lost: worker tcp://127.0.0.1:" in text
+    assert (tmp_path / "dask" / "table.parquet").read_bytes() == (tmp_path / "alone" / "table.parquet").read_bytes()
+
+
+def test_a_scheduler_that_is_not_there_is_named(
+    given: BatchConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr("node.commands.batch_dask._CONNECT_S", 0.2)
+    args = ["--out", given.out, "--prior", str(given.prior), "--dask", "tcp://127.0.0.1:1"]
+    assert main(["batch", *given.logs, *args]) == 1
+    assert "no Dask scheduler answers at tcp://127.0.0.1:1" in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.slow
+def test_real_parts_on_processes_make_the_same_table(tmp_path: Path, given: BatchConfig) -> None:
+    """The shipped recording with a small untrained prior: two processes and two parts, against one process."""
+    (tmp_path / "few.yaml").write_text(FEW)
+    args = ["--config", str(tmp_path / "few.yaml"), "--prior", str(given.prior), "--stages", "2", "--seeds", "2"]
+    log = str(Path(__file__).parents[3] / "perception" / "sources" / "shipped.mcap")
+    assert main(["batch", log, "--out", str(tmp_path / "one"), *args]) == 0
+    for i in range(2):
+        assert main(["batch", log, "--out", str(tmp_path / "two"), *args, "--shard", f"{i}/2", "--workers", "2"]) == 0
+    assert main(["batch", "--table-only", "--out", str(tmp_path / "two")]) == 0
+    one, two = (pq.read_table(tmp_path / name / "table.parquet").drop_columns(["seconds"]) for name in ("one", "two"))
+    assert one.equals(two) and one.num_rows == 4
