@@ -111,7 +111,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "fsspec": ("foundation/store.py",),
     "pyarrow": ("node/commands/batch_table.py",),
     "dask": ("node/commands/batch_dask.py",),  # the extra `cluster`, imported when it is asked for
-    "distributed": ("node/commands/batch_dask.py",),
+    "distributed": ("node/commands/batch_dask.py", "benchmarks/studies/batch.py"),
     "mcap": ("perception/sources/log_messages.py", "perception/sources/recorder.py"),
     "yaml": ("calibration/camera_file.py",),  # camera files, which ROS writes as YAML 1.1
     # launch files: YAML 1.2 (1e-3 is a number), no key twice; then into dataclasses

@@ -14,7 +14,7 @@ from node.commands.batch_task import TRIES, Event, Job, Record, Task
 from node.commands.batch_workers import worker_of
 
 _CONNECT_S = 10
-_LOOK_S = 1.0  # between two looks at which workers are there
+_LOOK_S = 10.0  # between two looks at which workers are there
 
 
 def do(job: Job, task: Task) -> Record:

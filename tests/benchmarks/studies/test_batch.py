@@ -1,0 +1,27 @@
+"""The measurement of a batch: rates, sizes and messages that are there, and what follows from them."""
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.studies.batch import Options, computed, main
+from perception.sources.settings import SHIPPED_LOG
+
+
+def test_a_hundred_machines_are_computed() -> None:
+    kept = {"unit_bytes": 1e5, "log_bytes": 0.0, "read_bytes": 2e6}
+    table = computed(Options(units=1000), kept, {"messages": 10.0, "message_bytes": 1e6, "seconds": 0.06})
+    found = dict(table.lines)
+    assert found["files of results"] == "2,500" and found["bytes of results"] == "0.1 GB"
+    assert found["logs to read, each once"] == "1 GB" and found["files written by a machine"] == "25"
+    assert found["scheduler's messages (Dask)"] == "15,000" and found["scheduler's bytes (Dask)"] == "1.50 GB"
+    assert found["scheduler's time, at most (Dask)"] == "2 min"  # of 1000 units and 500 logs
+
+
+@pytest.mark.slow
+def test_a_batch_is_measured(tmp_path: Path) -> None:
+    rows = {(row.condition, row.metric): row.value for row in main(Options(tmp_path, quick=True)).rows}
+    assert rows["1 workers", "units_per_hour"] > 0 and rows["2 workers", "units_per_hour"] > 0
+    assert rows["shipped recording", "read_bytes"] == SHIPPED_LOG.stat().st_size
+    assert 1e4 < rows["shipped recording", "unit_bytes"] < 3e6
+    assert 4 <= rows["empty logs", "task_messages"] < 100 and rows["empty logs", "task_message_bytes"] < 1e5
