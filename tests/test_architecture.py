@@ -121,12 +121,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "viser": ("node/viewer/page.py", "node/viewer/page_guard.py"),
     "websockets": ("node/viewer/page_guard.py",),  # viser's server
     "xxhash": ("node/ros/rmw_zenoh.py",),
-    "tyro": (
-        "node/__main__.py",
-        "node/commands/*options.py",
-        "benchmarks/*",
-        "examples/*",
-    ),
+    "tyro": ("node/__main__.py", "node/commands/*options.py", "benchmarks/*", "examples/*"),
     "trimesh": ("perception/answers/regions.py", "probnerf/objects/*", "probnerf/training/*", "benchmarks/scenes/*"),
     "igl": ("probnerf/objects/mesh.py", "benchmarks/scenes/strangers.py"),  # generalised winding numbers
     "embreex": ("perception/simulation/ray_caster.py",),  # the extra `meshes`, imported where it is needed
