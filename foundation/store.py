@@ -84,6 +84,14 @@ class Store:
         with ThreadPoolExecutor(_AT_ONCE) as pool:
             return dict(pool.map(content, names))
 
+    def has(self, name: str) -> bool:
+        """Whether a file is there now. Raises `StoreError`."""
+        try:
+            self._files.invalidate_cache()
+            return self._files.exists(self._place(name))
+        except Exception as error:
+            raise StoreError(f"{self.path(name)} cannot be read ({one_line(error)})") from None
+
     def sizes(self) -> dict[str, int]:
         """The files that are there now, by name in order, with their bytes. Raises `StoreError`."""
         try:

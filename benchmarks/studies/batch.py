@@ -121,7 +121,7 @@ def _messages() -> Iterator[dict[str, int]]:
             count["messages"] += len(message) if isinstance(message, list | tuple) else 1
         return message
 
-    TCP.write, TCP.read = counted_write, counted_read  # type: ignore[method-assign]
+    TCP.write, TCP.read = counted_write, counted_read  # type: ignore[assignment, method-assign]
     try:
         yield count
     finally:

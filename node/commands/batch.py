@@ -6,6 +6,7 @@ and its record last, each whole or not at all. What has a record is not done aga
 
 import hashlib
 import json
+import re
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, replace
@@ -208,13 +209,13 @@ def _said(task: Task, record: Record) -> tuple[str, str]:
 
 def _table(store: Store, settings: str | None, out: Console) -> int:
     """Make the table of all that is there, of these settings or those that were kept. The exit code."""
-    sizes = store.sizes()
-    if SETTINGS not in sizes:
+    if not store.has(SETTINGS):
         raise FileNotFoundError(f"{store.url} holds no results of `farside batch`; give the --out of a run")
+    sizes = store.sizes()
     kept = store.read([SETTINGS])[SETTINGS].decode()
     table = make_table(store, settings or _digest(kept), kept, sizes)
     failed = table["result"].to_pylist().count("failed")
-    files = [size for name, size in sizes.items() if name.startswith("logs/")]
+    files = [size for name, size in sizes.items() if re.search(r"^logs/.*\.(json|npz)$", name)]
     line = f"{store.path(TABLE)}: {table.num_rows} rows ({failed} failed)"
     line += f", of {len(files)} files with {sum(files) / 1e6:.2f} MB"
     out.print(line, highlight=False, soft_wrap=True)
@@ -235,7 +236,7 @@ def _settings(config: BatchConfig) -> dict[str, Any]:
 def _claimed(store: Store, settings: dict[str, Any]) -> str:
     """The digest of these settings, which the place holds from now on. Raises `ValueError` if it holds others."""
     text = json.dumps(settings, sort_keys=True, default=str, indent=1)
-    if SETTINGS not in store.sizes():
+    if not store.has(SETTINGS):
         store.write(SETTINGS, text.encode())
     kept = store.read([SETTINGS])[SETTINGS].decode()
     if kept != text:

@@ -1,5 +1,6 @@
 """`farside batch --dask`: the tasks on the workers of a Dask cluster. Needs the extra `farside[cluster]`."""
 
+import hashlib
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -40,9 +41,12 @@ def run_dask(
         here, looked = _workers(client), time.monotonic()
         say(f"{len(here)} workers; {_dashboard(client)}")
 
+        # a scheduler takes equal keys for the same task, and may have other runs
+        run = hashlib.blake2b(f"{job.out} {job.settings}".encode(), digest_size=8).hexdigest()
+
         def submitted(new: Iterable[Task], priority: int) -> dict[Future, Task]:
             how = {"pure": False, "retries": TRIES - 1, "priority": priority}
-            return {client.submit(do, job, task, key=f"farside {task.name}", **how): task for task in new}
+            return {client.submit(do, job, task, key=f"farside-{run}/{task.name}", **how): task for task in new}
 
         waiting = submitted(tasks, 0)
         ended = as_completed(waiting)

@@ -123,4 +123,7 @@ def _serve(connection: Connection, job: Job) -> None:
             answer = "unusable", str(error)
         except StoreError as error:
             answer = "lost", one_line(error)
-        connection.send(answer)
+        try:
+            connection.send(answer)
+        except OSError:  # the first process was killed; the record is written
+            return

@@ -46,7 +46,7 @@ def test_what_is_written_is_there(url: str) -> None:
     assert store.sizes() == {"a": 4, "b/c.json": 3}
     assert store.read(["b/c.json", "a"]) == {"b/c.json": b"{ }", "a": b"1234"}
     store.remove("a")
-    assert list(store.sizes()) == ["b/c.json"]
+    assert list(store.sizes()) == ["b/c.json"] and store.has("b/c.json") and not store.has("a")
     assert bytes_of([store.path("b")]) == {store.path("b"): 3}
     with pytest.raises(StoreError, match="a cannot be read"):
         store.read(["a"])

@@ -11,7 +11,7 @@ from perception.sources.settings import SHIPPED_LOG
 def test_a_hundred_machines_are_computed() -> None:
     kept = {"unit_bytes": 1e5, "log_bytes": 0.0, "read_bytes": 2e6}
     table = computed(Options(units=1000), kept, {"messages": 10.0, "message_bytes": 1e6, "seconds": 0.06})
-    found = dict(table.lines)
+    found = {what: value for what, value in table.lines}
     assert found["files of results"] == "2,500" and found["bytes of results"] == "0.1 GB"
     assert found["logs to read, each once"] == "1 GB" and found["files written by a machine"] == "25"
     assert found["scheduler's messages (Dask)"] == "15,000" and found["scheduler's bytes (Dask)"] == "1.50 GB"

@@ -1,6 +1,10 @@
 """`farside batch` with processes and on a Dask cluster: a worker that dies costs its unit one try, and no result."""
 
 import io
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +16,9 @@ from rich.console import Console
 from node.__main__ import main
 from node.commands.batch import FAILED, batch
 from node.commands.batch_options import BatchConfig
+from node.commands.batch_task import TRIES
+from perception.answers.hypotheses_file import load
+from perception.sources.settings import SHIPPED_LOG
 from probnerf.prior.checkpoint import save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from tests.node.commands.test_batch import here
@@ -58,13 +65,17 @@ def test_a_killed_worker_changes_no_result(given: BatchConfig, deaths: Path, tmp
     assert (tmp_path / "two" / "table.parquet").read_bytes() == (tmp_path / "alone" / "table.parquet").read_bytes()
 
 
-def test_what_kills_every_worker_is_given_up(given: BatchConfig, deaths: Path, tmp_path: Path) -> None:
-    for n in range(3):
+@pytest.mark.parametrize(("dask", "how"), [(None, "signal 9 (Killed)"), ("local", "died with it")])
+def test_what_kills_every_worker_is_given_up(
+    given: BatchConfig, deaths: Path, tmp_path: Path, dask: str | None, how: str
+) -> None:
+    for n in range(TRIES):
         (deaths / str(n)).touch()
-    code, text = run(replace(given, logs=(f"{given.logs[0]}/a",)))
-    assert code == FAILED and "1 units done, 0 were there, 1 failed" in text and "signal 9 (Killed); given up" in text
+    code, text = run(replace(given, logs=(f"{given.logs[0]}/a",), dask=dask))
+    assert code == FAILED and "1 units done, 0 were there, 1 failed" in text and f"{how}; given up" in text
+    assert not list(deaths.iterdir())
     alive, dead = pq.read_table(tmp_path / "alone" / "table.parquet").to_pylist()
-    assert alive["result"] == "converged" and dead["error"].startswith("given up after 3 tries: process ")
+    assert alive["result"] == "converged" and dead["error"].startswith("given up after 3 tries: ")
 
 
 def test_a_prior_that_cannot_be_read_ends_it_all(
@@ -101,10 +112,35 @@ def test_real_parts_on_processes_make_the_same_table(tmp_path: Path, given: Batc
     """The shipped recording with a small untrained prior: two processes and two parts, against one process."""
     (tmp_path / "few.yaml").write_text(FEW)
     args = ["--config", str(tmp_path / "few.yaml"), "--prior", str(given.prior), "--stages", "2", "--seeds", "2"]
-    log = str(Path(__file__).parents[3] / "perception" / "sources" / "shipped.mcap")
+    log = str(SHIPPED_LOG)
     assert main(["batch", log, "--out", str(tmp_path / "one"), *args]) == 0
     for i in range(2):
         assert main(["batch", log, "--out", str(tmp_path / "two"), *args, "--shard", f"{i}/2", "--workers", "2"]) == 0
     assert main(["batch", "--table-only", "--out", str(tmp_path / "two")]) == 0
     one, two = (pq.read_table(tmp_path / name / "table.parquet").drop_columns(["seconds"]) for name in ("one", "two"))
     assert one.equals(two) and one.num_rows == 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -9)])
+def test_no_process_stays_and_the_same_command_goes_on(
+    tmp_path: Path, given: BatchConfig, number: signal.Signals, code: int
+) -> None:
+    (tmp_path / "few.yaml").write_text(FEW)
+    args = ["--config", str(tmp_path / "few.yaml"), "--prior", str(given.prior), "--out", given.out]
+    command = [sys.executable, "-m", "farside", "batch", str(SHIPPED_LOG), *args, "--stages", "2"]
+    many = [*command, "--workers", "2", "--seeds", "500"]
+    with subprocess.Popen(many, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as started:
+        while "seed" not in (line := started.stderr.readline()):
+            assert line, "it ended by itself"
+        children = Path(f"/proc/{started.pid}/task/{started.pid}/children").read_text().split()
+        started.send_signal(number)
+        out, _ = started.communicate()
+    assert started.returncode == code and ("the same command goes on" in out) == (code == 130)
+    late = time.monotonic() + 60
+    while any(Path(f"/proc/{child}").exists() for child in children):
+        assert time.monotonic() < late, "a process stays"
+        time.sleep(0.1)
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "were there, 0 failed" in ended.stdout and "0 were there" not in ended.stdout
+    assert {load(path).object_id for path in Path(given.out).rglob("object_*.npz")} == {1, 2}  # all are whole

@@ -8,11 +8,12 @@ from dataclasses import asdict, fields
 import pytest
 
 from node.__main__ import main
+from node.commands.batch_options import BatchConfig
 from node.commands.config_file import from_mapping
 from node.commands.options import LiveConfig, ReplayConfig, options_of
 
 
-@pytest.mark.parametrize("kind", [ReplayConfig, LiveConfig])
+@pytest.mark.parametrize("kind", [ReplayConfig, LiveConfig, BatchConfig])
 def test_options_and_keys_are_fields_of_one_dataclass(kind: type) -> None:
     """What a file may hold is what the command line reads, but for --config; and the whole of it comes back."""
     options = {f.name for f in fields(options_of(kind, hidden=False))}
@@ -23,7 +24,7 @@ def test_options_and_keys_are_fields_of_one_dataclass(kind: type) -> None:
         from_mapping(kind, {"config": "other.yaml"})
 
 
-@pytest.mark.parametrize("command", ["replay", "live"])
+@pytest.mark.parametrize("command", ["replay", "live", "batch"])
 def test_nested_settings_are_listed_on_request_alone(capsys: pytest.CaptureFixture, command: str) -> None:
     text = {}
     for option in ("--help", "--help-all"):
