@@ -103,6 +103,7 @@ class Worker:
         return {
             "settings": self._job.settings,
             "log": task.log,
+            "frame": task.frame,
             "stamp_ns": int(h.stamp_ns),
             "object": h.object_id,
             "label": h.label,
