@@ -25,6 +25,7 @@ ORDER = {
     "Real frames": ("real", "segmentation"),
     "Scenes": ("scene",),
     "Strangers": ("out_of_model", "strangers", "kinds"),
+    "The paper": ("paper",),
     "The sampler alone": ("sbc", "chains", "acceptance"),
     "What it is worth to a planner": ("reach", "query", "next_view"),
     "Faults": ("stability",),
@@ -32,7 +33,13 @@ ORDER = {
     "The node": ("ingest", "bus", "record"),
 }
 TABLETOP = ROOT / "benchmarks" / "checkpoints" / "tabletop" / "prior.safetensors"
-PRIORS = {None: "The shipped prior", TABLETOP: "The prior before, of tabletop objects alone"}
+PAPER = ROOT / "benchmarks" / "checkpoints" / "paper"
+PRIORS = {
+    None: "The shipped prior",
+    TABLETOP: "The prior before, of tabletop objects alone",
+    PAPER / "cars.safetensors": "A prior of cars",
+    PAPER / "bodies.safetensors": "A prior of people",
+}
 TOGETHER = {"ingest": "node"}  # studies that today's transcription shows in one table, and its name
 INTRODUCTION = """# All figures
 

@@ -43,7 +43,7 @@ class Effort:
     vi_steps: int = 1500
 
 
-SMALL = Effort(iterations=40, leapfrog_steps=25, vi_steps=600)
+SHORT = Effort(iterations=40, leapfrog_steps=25, vi_steps=600)
 
 
 @dataclass(frozen=True, eq=False)

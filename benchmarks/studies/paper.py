@@ -17,12 +17,13 @@ annealing (the paper's figure of an ambulance's rear): vehicles from behind, 8 c
 the paper anneals it and at one temperature with its step of 0.0005. Chains are sorted by psnr_given of their last
 state: best, 4th, worst. `spread` is best less worst.
 
-`--small` shortens HMC to 40 x 25 and VI to 600 steps; the paper's own schedule runs without it. Fréchet distances,
+HMC is shortened to 40 x 25 and VI to 600 steps for two cores; `--full` runs the paper's own schedule. `--small` answers
+the first four objects anew, shows the tables of the committed rows, and how far the two differ. Fréchet distances,
 Functa and the other rivals, prior samples, and the renderer's experiment on these families are not there yet.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -32,7 +33,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.harness.intervals import Figures, gap_rows, mean_rows
 from benchmarks.harness.progress import say
-from benchmarks.harness.results import Line, Results, newest
+from benchmarks.harness.results import Line, Results, key, newest
 from benchmarks.harness.study import ResumedOptions, Summary, results_of, resumed, selected
 from benchmarks.harness.tables import Table, ranged
 from benchmarks.measures.metrics import psnr
@@ -40,7 +41,7 @@ from benchmarks.paper.cars import Car
 from benchmarks.paper.conditioned import PLACES, Conditioned, base_rate
 from benchmarks.paper.families import FAMILIES, SPLITS, Family
 from benchmarks.paper.judged import judge, pictures
-from benchmarks.paper.methods import CHAINS, ENCODER, FIXED, HMC, METHODS, PRIOR, SMALL, Effort, Question
+from benchmarks.paper.methods import CHAINS, ENCODER, FIXED, HMC, METHODS, PRIOR, SHORT, Effort, Question
 from probnerf.prior.checkpoint import Prior, load_prior
 
 WEIGHTS = Path(__file__).resolve().parent.parent / "checkpoints" / "paper"
@@ -59,8 +60,10 @@ ORDER = ("best", "4th", "worst", "spread")
 class Options(ResumedOptions):
     """The paper's experiments: posterior inference and annealing, on cars and bodies."""
 
+    full: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """The paper's own schedules; without, shorter ones for two cores."""
     small: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Shorter schedules, for two cores; without, the paper's own."""
+    """Answer four objects anew, and compare them with the kept rows."""
     n: int = 24
     """Objects of each family; of the annealing a third of them."""
     families: str = ""
@@ -73,7 +76,7 @@ class Options(ResumedOptions):
     @property
     def effort(self) -> Effort:
         """Lengths of the schedules."""
-        return SMALL if self.small or self.quick else Effort()
+        return Effort() if self.full and not self.quick else SHORT
 
     @property
     def chosen(self) -> list[Family]:
@@ -95,17 +98,25 @@ def main(options: Options) -> Summary:
         raise ValueError(f"{WEIGHTS} holds no prior; train one with `python -m benchmarks.paper.train --family cars`")
     priors = {family.name: load_prior(weights_of(family)) for family in families}
 
+    anew = Results(options.out / "paper-small.jsonl") if options.small else results
+
     def measure() -> None:
         for family in families:
-            _posteriors(options, family, priors[family.name], results)
+            _posteriors(options, family, priors[family.name], anew)
         if "cars" in priors:
-            _annealing(options, priors["cars"], results)
+            _annealing(options, priors["cars"], anew)
 
-    return resumed(results, options, measure, lambda: summary(results.lines, options))
+    def summed() -> Summary | None:
+        found = summary(results.lines, replace(options, small=False))
+        if not options.small or found is None:
+            return found
+        return Summary(found.rows, [*found.tables, agreement(anew.lines, results.lines)], found.picture)
+
+    return resumed(anew, options, measure, summed)
 
 
 def _count(options: Options) -> int:
-    return 1 if options.quick else options.n
+    return 1 if options.quick else min(options.n, 4) if options.small else options.n
 
 
 def _posteriors(options: Options, family: Family, prior: Prior, results: Results) -> None:
@@ -192,6 +203,17 @@ def summary(lines: list[Line], options: Options) -> Summary | None:
     if chains:
         tables.append(_chain_table(chains, rows))
     return Summary(rows, tables, lambda: _draw(Figures(rows))) if rows else None
+
+
+def agreement(anew: Sequence[Line], kept: Sequence[Line]) -> Table:
+    """How far rows that were made anew are from the kept ones of the same identity."""
+    before, cells = {key(line): line for line in kept}, []
+    for metric, unit in UNITS.items():
+        both = [(line, before[key(line)]) for line in anew if metric in line and key(line) in before]
+        differences = [abs(a[metric] - b[metric]) for a, b in both]
+        if differences:
+            cells.append([metric, unit, str(len(both)), *(f"{f(differences):.4f}" for f in (np.median, np.max))])
+    return Table("Made anew, beside the kept rows", ("", "unit", "answers", "median difference", "largest"), cells)
 
 
 def _seeds(options: Options) -> range:

@@ -116,7 +116,7 @@ def test_rows_are_kept_and_summed_up(tmp_path: Path, model: ProbNeRF, monkeypatc
     weights = tmp_path / "cars.safetensors"
     save_prior(weights, model, {"family": "cars"})
     monkeypatch.setattr(paper, "weights_of", lambda f: weights if f.name == "cars" else tmp_path / "none")
-    monkeypatch.setattr(paper, "SMALL", SHORT)
+    monkeypatch.setattr(paper, "SHORT", SHORT)
     values = {"psnr_given": 20.0, "psnr_heldout": 10.0, "psnr_heldout_of_mean": 11.0, "pixel_sd": 0.1}
     values |= {"hidden_nll": 0.3, "hidden_ece": 0.05}
     monkeypatch.setattr(paper, "judge", lambda *_: SimpleNamespace(values=values))
@@ -142,6 +142,9 @@ def test_rows_are_kept_and_summed_up(tmp_path: Path, model: ProbNeRF, monkeypatc
     assert value[ANNEALING, "hmc", "psnr_given, best"] > value[ANNEALING, "hmc", "psnr_given, worst"]
     assert found.picture is not None and found.picture().axes
     assert main(Options(tmp_path, **options)).rows == found.rows and len(asked) == 4
+    small = {**options, "quick": False, "small": True, "n": 1}
+    again = main(Options(tmp_path, **small))
+    assert len(asked) == 8 and again.tables[-1].lines[0] == ["psnr_given", "dB", "4", "0.0000", "0.0000"]
     with pytest.raises(ValueError, match=r"no family \['boats'\]; there are: cars; bodies"):
         main(Options(tmp_path, families="boats"))
     monkeypatch.setattr(paper, "weights_of", lambda _: tmp_path / "none")
