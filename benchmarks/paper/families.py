@@ -1,17 +1,20 @@
 """The families of the ProbNeRF paper's experiments, in pictures and as shapes to learn from.
 
 Pictures are those of SRN Cars but for their contents: a known canonical pose, a camera at a fixed distance that looks
-at the middle, white where nothing is. 50 of each object by default.
+at the middle, white where nothing is. 50 of each object by default. `python -m benchmarks.paper.families` writes them
+in SRN's layout, for `farside train --data`; it goes on where it ended.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
+import tyro
 from jaxtyping import Bool, Float, UInt8
 
+from benchmarks.harness.progress import say
 from benchmarks.paper.bodies import draw_person
 from benchmarks.paper.cars import draw_car
 from perception.simulation.ray_caster import RayCaster
@@ -130,7 +133,10 @@ def shape_set(family: Family, seeds: Sequence[int], progress: Callable[[int, int
 
 
 def write_srn(family: Family, seed: int, folder: Path, views: int, size: int) -> Path:
-    """The object's pictures in the layout of SRN data sets (`probnerf.training.srn_dataset`), as `folder`/SEED."""
+    """The object's pictures in the layout of SRN data sets (`probnerf.training.srn_dataset`), as `folder`/SEED.
+
+    As there, the cube is about the middle of what is seen.
+    """
     seen = render(family.draw(seed), family.cameras(seed, views), size)
     T_world_camera = seen.T_object_camera.astype(np.float64)
     T_world_camera[:, :3, 3] *= 0.5  # the cube has side 1 there
@@ -138,10 +144,41 @@ def write_srn(family: Family, seed: int, folder: Path, views: int, size: int) ->
         name=f"{seed:07d}",
         focal=0.5 * size / TAN_HALF_FOV,
         centre=(0.5 * size, 0.5 * size),
-        barycentre=(0.0, 0.0, 0.0),
+        barycentre=(0.5 * family.middle[0], 0.5 * family.middle[1], 0.5 * family.middle[2]),
         scale=1.0,
         rgb=seen.rgb,
         mask=seen.mask,
         T_world_camera=T_world_camera,
     )
     return write_instance(folder, instance)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Write a family's pictures as an SRN data set."""
+
+    out: Path
+    """Folder of the instances."""
+    family: Literal["cars", "bodies"] = "cars"
+    """What is drawn."""
+    split: Literal["train", "val", "test"] = "train"
+    """Of which seeds."""
+    count: int = 2458
+    """Objects, the first seeds."""
+    views: int = VIEWS
+    """Pictures of each."""
+    size: int = 128
+    """px a side."""
+
+
+def main(options: Options) -> None:
+    """Write what the folder lacks. An instance is whole if its last pose is there."""
+    for done, seed in enumerate(SPLITS[options.split][: options.count], start=1):
+        if not (options.out / f"{seed:07d}" / "pose" / f"{options.views - 1:06d}.txt").is_file():
+            write_srn(FAMILIES[options.family], seed, options.out, options.views, options.size)
+        if done % 100 == 0 or done == options.count:
+            say(f"{done} of {options.count}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,15 +1,33 @@
 """The paper's families: closed solids in their frame, pictures that agree with them, and SRN folders that read back."""
 
+import io
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from benchmarks.paper.bodies import draw_person
 from benchmarks.paper.body_template import BONES, load_template, read_assets
 from benchmarks.paper.cars import STYLES, draw_car
-from benchmarks.paper.families import BODIES, CARS, FAMILIES, SPLITS, Family, render, shape_set, view_set, write_srn
+from benchmarks.paper.families import (
+    BODIES,
+    CARS,
+    FAMILIES,
+    SPLITS,
+    Family,
+    Options,
+    main,
+    render,
+    shape_set,
+    view_set,
+    write_srn,
+)
+from node.commands.train import train
+from node.commands.training_options import Training
 from probnerf.geometry import pinhole_rays
+from probnerf.prior.checkpoint import load_prior
+from probnerf.training.settings import TrainConfig
 from probnerf.training.shape_set import in_cube
 from probnerf.training.srn_dataset import read_instance
 from probnerf.types import BASE_Z, BODY_EXTENT
@@ -79,7 +97,26 @@ def test_srn_folders_read_back(tmp_path: Path) -> None:
     views = view_set(CARS, [5], 3, 32)
     np.testing.assert_array_equal(read.mask, views.range[0] > 0)
     np.testing.assert_array_equal(read.rgb, views.rgb[0])
-    np.testing.assert_allclose(read.T_cube_camera, views.T_object_camera[0], atol=1e-6)
+    about = read.T_cube_camera
+    about[:, :3, 3] += CARS.middle
+    np.testing.assert_allclose(about, views.T_object_camera[0], atol=1e-6)
+
+
+def test_a_folder_of_a_family_is_completed_and_trains(tmp_path: Path) -> None:
+    """The command of the paper's own experiment, on a small folder in the layout of SRN Cars."""
+    options = Options(tmp_path / "cars_train", count=2, views=3, size=32)
+    main(options)
+    (first, second) = sorted(options.out.iterdir())
+    before = (first / "rgb" / "000000.png").stat().st_mtime_ns
+    (second / "pose" / "000002.txt").unlink()
+    main(options)
+    assert (second / "pose" / "000002.txt").is_file()
+    assert (first / "rgb" / "000000.png").stat().st_mtime_ns == before
+    recipe = TrainConfig(steps=2, ray_batch=2, views=2, object_rays=8, near_rays=4, far_rays=4)
+    console = Console(file=io.StringIO())
+    training = Training(out=tmp_path / "run", preset="tiny", data=options.out, recipe=recipe)
+    assert train(training, console, console)
+    assert load_prior(tmp_path / "run" / "prior.safetensors").model.preset.name == "tiny"
 
 
 def test_splits_share_no_seed() -> None:
