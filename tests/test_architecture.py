@@ -1,6 +1,6 @@
 """The folders are the architecture: who may import whom, one importing file per outside library, and the house rules.
 
-Each rule is a function from a file's path and syntax tree to complaints, so the rules themselves are tested at the end.
+Each rule is a function from a file's path and syntax tree to complaints; test_architecture_rules.py tests the rules.
 """
 
 import ast
@@ -310,50 +310,3 @@ def test_launch_holds_no_python_package() -> None:
         if path.is_file() and "__pycache__" not in path.parts and "farside_msgs" not in path.parts:
             assert path.name.endswith((".yaml", ".launch.py")), f"{path.relative_to(ROOT)} does not belong in launch/"
         assert path.name != "__init__.py", f"{path.relative_to(ROOT)} makes launch/ importable"
-
-
-@pytest.mark.parametrize(
-    ("rule", "path", "source", "said"),
-    [
-        (breaks_diamond, "probnerf/a.py", "def f():\n    from calibration.camera import Camera", "imports calibration"),
-        (breaks_diamond, "perception/a.py", "from .. import node", "imports node"),
-        (breaks_diamond, "probnerf/fields/a.py", "from ...node.bus import Bus", "imports node"),
-        (breaks_layers, "perception/sources/a.py", "from perception.answers.query import query", "stands above it"),
-        (breaks_layers, "probnerf/a.py", "", "stands in no layer of probnerf"),
-        (
-            breaks_diamond,
-            "calibration/a.py",
-            "importlib.import_module('perception.sources.open_source')",
-            "imports perception",
-        ),
-        (breaks_importer_rule, "perception/a.py", "import zenoh.ext", "a.py imports zenoh, which only node/ros/bus.py"),
-        (breaks_importer_rule, "probnerf/a.py", "import torch", "a.py imports torch, which is not in the table"),
-        (can_execute_code, "probnerf/a.py", "np.load(f, allow_pickle=True)", "a.py:1 passes allow_pickle"),
-        (can_execute_code, "probnerf/a.py", "import pickle", "imports pickle"),
-        (has_global_state, "probnerf/a.py", "def f():\n    global x", "a.py:2 rebinds the module's x"),
-        (
-            hides_a_broken_install,
-            "node/a.py",
-            "try:\n    from perception.answers.query import query\nexcept (OSError, ImportError):\n    pass",
-            "a.py:1 goes on without perception",
-        ),
-        (has_vague_name, "node/utils.py", "", "`utils` says nothing"),
-        (has_untyped_signature, "node/a.py", "class A:\n    def f(self, x) -> int: ...", "a.py:2 f: no type for x"),
-    ],
-)
-def test_rule_finds(rule: Rule, path: str, source: str, said: str) -> None:
-    assert said in "".join(rule(PurePosixPath(path), ast.parse(source)))
-
-
-@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
-def test_rule_accepts(rule: Rule) -> None:
-    source = """
-from ..types import Pose
-from . import foam
-import jax.numpy as jnp, numpy as np, os.path
-def area(x: float, *, y: float = 1) -> float:
-    return _times(x, y)
-def _times(x, y): return x * y
-np.load("f", allow_pickle=False)
-"""
-    assert not list(rule(PurePosixPath("probnerf/objects/a.py"), ast.parse(source)))

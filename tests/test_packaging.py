@@ -38,8 +38,8 @@ def names(requirements: list[str]) -> set[str]:
 
 
 def test_every_imported_library_is_declared() -> None:
-    """A package imports dependencies and those of the extras `cluster` and `meshes`; tests those of `dev`, too."""
-    runtime = names(project()["project"]["dependencies"] + extra("cluster") + extra("meshes"))
+    """A package imports dependencies and those of the other extras; tests those of `dev`, too."""
+    runtime = names(project()["project"]["dependencies"] + extra("cluster") + extra("meshes") + extra("planners"))
     developer = runtime | names(extra("dev"))
     distributions = packages_distributions()
     undeclared = []
