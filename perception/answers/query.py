@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from perception.answers.hypotheses import FrameName, Hypotheses, binary_entropy
 from perception.answers.regions import Cells, Points, Region, Swept
@@ -93,10 +93,12 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
     touched = []  # objects that have voxels in the region
     p_free, p_free_se, p_free_few, volumes, entropies = [], [], [], [], []
     blocked_by: dict[int, list[int]] = {}
+    met = False  # it has a voxel above the table
     for h in scene:
         index, volume = _region_voxels(h, region, frame)
         if not len(index):
             continue
+        met = met or bool(_above(index, h).any())
         occupied = h.solid.reshape(len(h.weights), -1).take(index, axis=1)
         blocked = np.asarray(occupied.any(axis=1))
         if blocked.any():
@@ -116,6 +118,8 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
     # Errors of a product of independent factors: sum over objects of (se_o times the other factors)^2.
     others = [np.prod(p_free[:o] + p_free[o + 1 :]) for o in range(len(p_free))]
     unseen, outside = _fractions(scene, region, frame)
+    if met:  # of a region so large that no sample fell into a cube
+        outside = min(outside, float(np.nextafter(1.0, 0.0)))
     points = region if isinstance(region, Points) else None
     known = math.nan if outside == 1.0 else 1.0
     return QueryResult(
@@ -239,10 +243,7 @@ def _lattice(
 
 
 def _fractions(scene: Sequence[Hypotheses], region: Region, frame: FrameName) -> tuple[float, float]:
-    """Shares of the region that are (inside some cube but not seen, outside every cube or inside the table).
-
-    The table's height may err by a voxel.
-    """
+    """Shares of the region that are (inside some cube but not seen, outside every cube or inside the table)."""
     share = np.ones(())
     if isinstance(region, Points | Cells):
         x, y, z = region.points.T if isinstance(region, Points) else region.centres.T
@@ -257,11 +258,16 @@ def _fractions(scene: Sequence[Hypotheses], region: Region, frame: FrameName) ->
     inside = seen = np.zeros((), bool)
     for h in scene:
         index = h.voxels(frame, x, y, z)
-        above = (index >= 0) & ((index % h.grid + 1.5) * 2.0 / h.grid - 1.0 >= BASE_Z)
+        above = (index >= 0) & _above(index, h)
         inside = inside | above
         seen = seen | (above & h.seen.ravel()[index])
     share = np.broadcast_to(share, np.shape(inside))
     return float(np.average(inside & ~seen, weights=share)), float(np.average(~inside, weights=share))
+
+
+def _above(index: Int[np.ndarray, "..."], h: Hypotheses) -> Bool[np.ndarray, "..."]:
+    """Which voxels, by flat index, lie above the table, whose height may err by a voxel."""
+    return (index % h.grid + 1.5) * 2.0 / h.grid - 1.0 >= BASE_Z
 
 
 def _sampled(region: Swept, width: float) -> tuple[Float[np.ndarray, "3 n"], Float[np.ndarray, "n"]]:

@@ -100,12 +100,12 @@ def test_a_wider_voxel_has_the_largest_probability_in_it() -> None:
     both = octomap_message([h, body_with_handle(object_id=2)], "/farside", 0.04)
     wide = leaves(octomap_message([h], "/farside", 0.04).data.tobytes())
     fine = leaves(octomap_message([h], "/farside", h.voxel_m).data.tobytes())
-    largest = {}
+    largest: dict[tuple[int, ...], float] = {}
     for corner, (edge, value) in fine.items():
         for offset in np.ndindex(edge, edge, edge):
             cell = tuple(np.floor_divide(np.add(corner, offset), 4).tolist())
             largest[cell] = max(value, largest.get(cell, -np.inf))
-    spread = {}
+    spread: dict[tuple[int, ...], float] = {}
     for corner, (edge, value) in wide.items():
         spread |= {tuple(np.add(corner, o).tolist()): value for o in np.ndindex(edge, edge, edge)}
     assert spread == largest

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from perception.answers.query import query
-from perception.answers.regions import Cells, Swept, read_mesh, read_points
+from perception.answers.regions import Box, Cells, Points, Swept, moved, read_mesh, read_points
 from tests.perception.answers.test_query import LEFT, RIGHT, VOXEL, _swept, mug
 
 __all__ = ["mug"]  # the fixture
@@ -54,6 +54,19 @@ def test_cells_wider_than_voxels_miss_none(mug) -> None:
     wide = Cells(middle[None], 3.0 * VOXEL)
     box = Swept(np.eye(4)[None] + np.pad(middle[None, :, None], ((0, 0), (0, 1), (3, 0))), np.full((1, 3), 3 * VOXEL))
     assert query([mug], wide, "object").volume_m3 == pytest.approx(query([mug], box, "object").volume_m3)
+
+
+def test_a_moved_region_answers_in_its_frame_as_before(mug) -> None:
+    """And a box so large that no sample of it falls into the cube is known still: it has the mug in it."""
+    T = np.linalg.inv(mug.object_frame.T_camera_object)  # p_object = T @ p_camera
+    box = Box((-0.1, -0.1, 0.4), (0.1, 0.02, 0.55))
+    points = Points(np.random.default_rng(0).uniform(box.low, box.high, (40, 3)))
+    for region in (box, points, moved(box, np.eye(4))):
+        before, after = query([mug], region, "camera", now_ns=0), query([mug], moved(region, T), "object", now_ns=0)
+        assert before.p_free == after.p_free and before.p_occupied == after.p_occupied
+        assert before.unseen_fraction == pytest.approx(after.unseen_fraction, abs=0.02)
+    wide = query([mug], moved(Box((-9, -9, -9), (9, 9, 9)), np.eye(4)), "camera", now_ns=0)
+    assert wide.p_free == 0.0 and wide.outside_fraction < 1.0 and wide.verdict() == "unsure"  # of two hypotheses
 
 
 def test_what_is_no_mesh_is_named(tmp_path: Path) -> None:
