@@ -81,13 +81,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "safetensors": ("probnerf/prior/checkpoint.py",),
     "blackjax": (),  # an independent sampler to test against
     # pictures in a second, before matplotlib is imported; PNG files, resized
-    "cv2": (
-        "calibration/*",
-        "perception/*",
-        "node/*/segment*.py",
-        "probnerf/*/srn_dataset.py",
-        "benchmarks/*/intrinsics.py",
-    ),
+    "cv2": ("calibration/*", "perception/*", "node/*/segment*.py", "probnerf/*/srn*.py", "benchmarks/*/intrinsics.py"),
     "scipy": (
         "node/figures/object_figure.py",  # morphology
         "node/figures/voxel_renderer.py",

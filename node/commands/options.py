@@ -274,7 +274,8 @@ class Calibrate:
     board: Annotated[
         str | None, arg(metavar="BOARD", help_behavior_hint="(default: charuco:7x5:0.035:0.026:DICT_5X5_100)")
     ] = None
-    """chessboard:8x6:0.025 (inner corners, square in m) or charuco with squares, square, marker and dictionary."""
+    """chessboard:8x6:0.025 (inner corners, square in m), charuco with squares, square, marker and dictionary,
+    circles:7x5:0.03, asymmetric_circles:4x11:0.02, or aprilgrid:6x6:0.03:0.3 (tags, tag in m, gap in tags)."""
     out: Annotated[Path, arg(metavar="FILE.yaml")] = Path("camera.yaml")
     """The camera file, as ROS reads it, with standard deviations; a picture (.png) of the views goes beside it."""
     model: Annotated[

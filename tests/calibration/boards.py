@@ -34,7 +34,8 @@ def poses(
         ray = camera.rays(np.array([rng.uniform([100, 80], [540, 400])]))[0]
         T[:3, 3] = ray * rng.uniform(*away) * board.square - T[:3, :3] @ board.corners.mean(axis=0)
         px = camera.project(board.corners @ T[:3, :3].T + T[:3, 3])
-        if np.isfinite(px).all() and (px > 5).all() and (px < [635, 475]).all():
+        edge = 20 if board.radius else 5  # px
+        if np.isfinite(px).all() and (px > edge).all() and (px < np.array(SIZE) - edge).all():
             found.append(T)
     return found
 
@@ -61,11 +62,16 @@ def photograph(model: str, board: Board, T: np.ndarray) -> np.ndarray:
     rays, R, t = rays_of(model), T[:3, :3], T[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         at = ((rays * ((R[:, 2] @ t) / (rays @ R[:, 2]))[:, None] - t) @ R)[:, :2]
-    fine = 40  # px per square of a drawing, blurred to about a pixel of the picture
+    # px per square of a drawing, blurred to about a pixel of the picture; whole modules of an AprilGrid's tags, too
+    fine = 52 if board.kind == "aprilgrid" else 40
     across, down = board.squares
-    drawing = np.full(((down + 2) * fine, (across + 2) * fine), 230, np.uint8)
+    drawing = np.full((round((down + 2) * fine), round((across + 2) * fine)), 230, np.uint8)
     for x0, y0, x1, y1 in np.rint((board.dark() / board.square + 1) * fine).astype(int):
         drawing[y0:y1, x0:x1] = 25
+    if board.radius:
+        discs, radius = (board.corners[:, :2] / board.square + 1) * fine - 0.5, board.radius / board.square * fine
+        y, x = np.indices(drawing.shape)
+        drawing[(np.hypot(x[..., None] - discs[:, 0], y[..., None] - discs[:, 1]) < radius).any(axis=-1)] = 25
     maps = (np.nan_to_num((at / board.square + 1) * fine - 0.5, nan=-1e3).clip(-1e3, 1e4)).astype(np.float32)
     maps = maps.reshape(SIZE[1], SIZE[0], 2)
     soft = cv2.GaussianBlur(drawing, (0, 0), 0.8)
