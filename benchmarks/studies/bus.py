@@ -123,7 +123,7 @@ def peer(endpoint: str, name: str, points: int, hypotheses: int) -> None:
 
     with Bus(BusConfig(name=name, connect=(endpoint,), max_rate=_FAST), say) as bus:
         answers = Answers()
-        answers.update([_scene(hypotheses)])
+        answers.update([box_scene(hypotheses)])
         answers.serve(bus)
         serve_parameters(bus, counts)
         pong = bus.publisher("/pong", _IMAGE)
@@ -133,7 +133,7 @@ def peer(endpoint: str, name: str, points: int, hypotheses: int) -> None:
         sys.stdin.read()
 
 
-def _scene(count: int, grid: int = 64) -> Hypotheses:
+def box_scene(count: int, grid: int = 64) -> Hypotheses:
     """Boxes of random sizes."""
     rng = np.random.default_rng(0)
     half = rng.uniform(0.2, 0.8, (count, 3))

@@ -4,7 +4,6 @@ Seeded; more of them by `MANGLED=2000 pytest tests/properties/test_mangled_files
 """
 
 import json
-import os
 import random
 import shutil
 from pathlib import Path
@@ -12,47 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from node.__main__ import main
 from perception.answers.hypotheses_file import save
 from perception.observation.segmentation import segment
 from perception.sources.frame_folder import write_frame_folder
 from perception.sources.recorder import write_log
 from tests.node.mugs import mug_hypotheses, table_frame
 from tests.perception.cylinders import CAN, picture
+from tests.properties.mangling import COUNT, VALUES, mangled, told
 
-COUNT = int(os.environ.get("MANGLED", "40"))  # of each kind
-VALUES = [None, True, -1, 0, 1e308, float("nan"), float("inf"), 10**30, "x", [], {}, [[1]], [1, 2, 3], {"a": 1}, 1e-300]
 KEYS = ("camera_matrix_std_px", "rms_px", "distortion_std", "depth_camera_matrix_px", "T_color_depth", "T_world_camera")
-
-
-def mangled(data: bytes, rng: random.Random) -> bytes:
-    """Bytes with some flipped, zeroed, doubled, replaced or cut off."""
-    at, kind = rng.randrange(len(data)), rng.choice(["flip", "flip", "zero", "cut", "double", "noise"])
-    if kind == "cut":
-        return data[:at]
-    if kind == "double":
-        return data[:at] + data[at : at + rng.choice([1, 8, 100])] + data[at:]
-    changed = bytearray(data)
-    if kind == "flip":
-        for _ in range(rng.choice([1, 1, 3, 20])):
-            changed[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-    else:
-        size = min(rng.choice([4, 64, 512]), len(data) - at)
-        changed[at : at + size] = bytes(size) if kind == "zero" else rng.randbytes(size)
-    return bytes(changed)
-
-
-def told(arguments: list[str], path: Path, out: Path, capfd: pytest.CaptureFixture) -> int:
-    """Run the program; what it says must be one line that names the file, or nothing of an error."""
-    code = main([str(argument) for argument in arguments])
-    error = capfd.readouterr().err
-    assert code in (0, 1), error
-    if code == 1:
-        assert error.startswith("farside: error: ") and error.count("\n") == 1 and "--debug" not in error, error
-        assert str(path) in error, error
-        assert not out.exists()
-    out.unlink(missing_ok=True)
-    return code
 
 
 @pytest.fixture
