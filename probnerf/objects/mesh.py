@@ -155,12 +155,12 @@ def read_folder(folder: Path, y_up: Sequence[str] = (".glb", ".gltf")) -> Iterat
         try:
             mesh = trimesh.load_mesh(file)
             mesh.merge_vertices(merge_tex=True, merge_norm=True)
-        except Exception as error:  # a broken file may fail anywhere in its reader
+            if file.suffix.lower() in y_up:
+                mesh.apply_transform(trimesh.transformations.rotation_matrix(0.5 * np.pi, [1, 0, 0]))
+            reason = why_not(mesh)
+        except Exception as error:  # a broken file may fail anywhere in its reader, or where its mesh is used
             yield file.stem, f"cannot be read ({str(error).splitlines()[0] if str(error) else type(error).__name__})"
             continue
-        if file.suffix.lower() in y_up:
-            mesh.apply_transform(trimesh.transformations.rotation_matrix(0.5 * np.pi, [1, 0, 0]))
-        reason = why_not(mesh)
         yield file.stem, reason or mesh
 
 
@@ -170,6 +170,8 @@ def why_not(mesh: trimesh.Trimesh) -> str:
         return "no triangles"
     if len(mesh.faces) > MOST_FACES:
         return f"{len(mesh.faces)} faces, more than {MOST_FACES}; decimate it"
+    if mesh.vertices.shape[1:] != (3,) or not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+        return "a face names a corner that is not there"
     if not np.isfinite(mesh.vertices).all():
         return "a vertex is not finite"
     sides = np.sort(mesh.extents)
