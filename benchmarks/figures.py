@@ -38,7 +38,6 @@ PRIORS = {
     None: "The shipped prior",
     TABLETOP: "The prior before, of tabletop objects alone",
     PAPER / "cars.safetensors": "A prior of cars",
-    PAPER / "bodies.safetensors": "A prior of people",
 }
 TOGETHER = {"ingest": "node"}  # studies that today's transcription shows in one table, and its name
 INTRODUCTION = """# All figures

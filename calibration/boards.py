@@ -134,9 +134,9 @@ class Board:
         for number in range(self.columns * self.rows):
             row, column = divmod(number, self.columns)
             image = cv2.aruco.generateImageMarker(dictionary, number, side, borderBits=_KALIBRS_BORDER)[::-1, ::-1]
-            y, x = np.nonzero(image == 0)
+            down, across = np.nonzero(image == 0)
             corner = np.array([gap + column * self.square, height - (row + 1) * self.square])
-            low = corner + module * np.column_stack([x, y])
+            low = corner + module * np.column_stack([across, down])
             rectangles.append(np.column_stack([low, low + module]))
         x, y = np.meshgrid(np.arange(self.columns + 1), np.arange(self.rows + 1))
         low = self.square * np.column_stack([x.ravel(), y.ravel()])
@@ -174,9 +174,9 @@ class Board:
     def _find_circles(
         self, grey: UInt8[np.ndarray, "h w"], size: tuple[int, int]
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        parameters = cv2.SimpleBlobDetector_Params()
+        parameters = cv2.SimpleBlobDetector.Params()
         parameters.minArea, parameters.maxArea, parameters.minDistBetweenBlobs = 12.0, grey.size / 20, 3.0
-        blobs = cv2.SimpleBlobDetector_create(parameters)
+        blobs = cv2.SimpleBlobDetector.create(parameters)
         layout = cv2.CALIB_CB_SYMMETRIC_GRID if self.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
         for flags in (layout | cv2.CALIB_CB_CLUSTERING, layout):
             found, pixels = cv2.findCirclesGrid(grey, size, flags=flags, blobDetector=blobs)

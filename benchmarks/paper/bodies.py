@@ -103,9 +103,10 @@ class Person:
 
     @property
     def description(self) -> Float[np.ndarray, "d"]:
-        """The parameters of appearance as numbers of order 1. The pose is in the shape."""
+        """The parameters of appearance and pose as numbers of order 1: a coarse grid of distances shows no arm well."""
         flags = [2.0 * self.shorts, 2.0 * self.long_hair, *2.0 * np.eye(3)[self.sleeves]]
-        parts = [2.0 * self.colours - 1.0, self.light, self.ambient, self.lamp, flags]
+        pose = [*self.turns.values(), 5.0 * np.log(self.stretch), [10.0 * self.belly]]
+        parts = [2.0 * self.colours - 1.0, self.light, self.ambient, self.lamp, flags, *pose]
         return np.concatenate([np.ravel(np.asarray(part, np.float32)) for part in parts])
 
 

@@ -43,6 +43,7 @@ from node.ros.bus import Bus
 from node.ros.messages import QUERY_REGION, encode, header, make, type_hash
 from node.ros.publishers import Announcer
 from node.ros.rmw_zenoh import attachment, key
+from node.ros.services import Answers
 from node.ros.settings import BusConfig
 from node.viewer.page import Page
 from perception.sources.frame import Frame
@@ -185,8 +186,9 @@ def node(record: str, how: str, seconds: float, seed: int) -> None:
         stack.callback(keeper.close)
         stack.enter_context(reader)
         keeper.thread.start()
-        live = LiveNode(config, _Tracker(), announcer, reader, keeper, recorder, err)  # type: ignore[arg-type]
-        live.answers.serve(bus)
+        answers = Answers(announcer.node)
+        live = LiveNode(config, _Tracker(), announcer, answers, reader, keeper, recorder, err)  # type: ignore[arg-type]
+        answers.serve(bus)
         live.show = page.show
         print(bus.config.listen[0], flush=True)
         memory: list[tuple[int, float]] = []

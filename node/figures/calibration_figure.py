@@ -76,18 +76,19 @@ def _draw_map(ax: Axes, misses: Projection, values: np.ndarray, title: str) -> N
     x, y = misses.places[0, :, 0], misses.places[:, 0, 1]
     drawn = ax.pcolormesh(x, y, values, shading="nearest", cmap=_PALE, norm="log")
     ax.figure.colorbar(drawn, ax=ax, label="px", shrink=0.75)
+    dark = np.asarray(drawn.norm(values)) > 0.6
     for (row, column), value in np.ndenumerate(values):
         if np.isfinite(value):
             across = {0: "left", len(x) - 1: "right"}.get(column, "center")
             down = {0: "top", len(y) - 1: "bottom"}.get(row, "center")
             ax.text(
-                x[column],
-                y[row],
+                float(x[column]),
+                float(y[row]),
                 f"{value:.2f}",
                 ha=across,
                 va=down,
                 fontsize=8,
-                color="white" if drawn.norm(value) > 0.6 else "#333333",
+                color="white" if dark[row, column] else "#333333",
             )
     ax.set_title(title, fontsize=10)
 

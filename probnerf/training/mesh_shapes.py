@@ -128,7 +128,7 @@ class Painted(Protocol):
 
     @property
     def description(self) -> Float[np.ndarray, "p"]:
-        """At most PAINT_NUMBERS numbers of order 1."""
+        """At most PAINT_NUMBERS + TABLETOP_NUMBERS numbers of order 1."""
         ...
 
 
