@@ -5,6 +5,7 @@ field has is an error that names the nearest one; a value of another type than t
 """
 
 import json
+import reprlib
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, fields, is_dataclass
 from difflib import get_close_matches
@@ -83,7 +84,7 @@ def _complaint(into: type, errors: ValidationError) -> str:
     """The first error in one line."""
     error = errors.errors()[0]
     path, value, kind = error["loc"], error["input"], error["type"]
-    where, above = _dotted(path), path[:-1]
+    where, above, shown = _dotted(path), path[:-1], reprlib.repr(value)
     if kind == "value_error":  # a configuration that checks itself
         return f"{where}: {error['ctx']['error']}" if where else str(error["ctx"]["error"])
     if kind == "unexpected_keyword_argument":
@@ -94,14 +95,14 @@ def _complaint(into: type, errors: ValidationError) -> str:
     if kind == "missing" and isinstance(path[-1], str):
         return f"{_dotted(above) or 'the file'} lacks {path[-1]}"
     if kind == "missing":
-        return f"{_dotted(above)} is {value!r}; give more entries"
+        return f"{_dotted(above)} is {shown}; give more entries"
     if kind == "dataclass_type":
-        return f"{where or 'the file'} is {value!r}; give a mapping with keys of {', '.join(_keys(into, path))}"
+        return f"{where or 'the file'} is {shown}; give a mapping with keys of {', '.join(_keys(into, path))}"
     if kind == "too_long":
-        return f"{where} is {value!r}; give {error['ctx']['max_length']} entries"
+        return f"{where} is {shown}; give {error['ctx']['max_length']} entries"
     if kind == "literal_error":
-        return f"{where} is {value!r}; give {error['ctx']['expected']}"
-    return f"{where} is {value!r}; " + (f"give {_REMEDIES[kind]}" if kind in _REMEDIES else error["msg"])
+        return f"{where} is {shown}; give {error['ctx']['expected']}"
+    return f"{where} is {shown}; " + (f"give {_REMEDIES[kind]}" if kind in _REMEDIES else error["msg"])
 
 
 def _dotted(path: tuple[int | str, ...]) -> str:

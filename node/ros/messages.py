@@ -5,6 +5,7 @@ builds them cannot differ. A message is an object with its fields by name; array
 geometry_msgs: metres and unit quaternions.
 """
 
+import math
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -186,7 +187,7 @@ def matrix(message: Any) -> Float[np.ndarray, "4 4"]:
     """The rigid transform of a geometry_msgs/Pose. Raises ValueError if its quaternion is invalid."""
     p, q = message.position, message.orientation
     values = np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w], np.float64)
-    if not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1.0) > 1e-3:
+    if not np.isfinite(values).all() or abs(math.hypot(*values[3:]) - 1.0) > 1e-3:
         raise ValueError(f"the pose {values.tolist()} is not finite with a quaternion (x y z w) of length 1")
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat(values[3:]).as_matrix()
