@@ -73,10 +73,11 @@ def _draw_corners(ax: Axes, result: Calibration) -> None:
 
 def _draw_map(ax: Axes, misses: Projection, values: np.ndarray, title: str) -> None:
     """Pixels over the picture, with the numbers; white where no ray is known."""
-    x, y = misses.places[0, :, 0], misses.places[:, 0, 1]
+    values = np.maximum(values, 1e-3)  # of a picture without errors, the logarithm
+    x, y = misses.places[0, :, 0].tolist(), misses.places[:, 0, 1].tolist()
+    middle = float(np.sqrt(np.nanmin(values) * np.nanmax(values)))  # of the colours
     drawn = ax.pcolormesh(x, y, values, shading="nearest", cmap=_PALE, norm="log")
     ax.figure.colorbar(drawn, ax=ax, label="px", shrink=0.75)
-    dark = np.asarray(drawn.norm(values)) > 0.6
     for (row, column), value in np.ndenumerate(values):
         if np.isfinite(value):
             across = {0: "left", len(x) - 1: "right"}.get(column, "center")
@@ -88,7 +89,7 @@ def _draw_map(ax: Axes, misses: Projection, values: np.ndarray, title: str) -> N
                 ha=across,
                 va=down,
                 fontsize=8,
-                color="white" if dark[row, column] else "#333333",
+                color="white" if value > 1.2 * middle else "#333333",
             )
     ax.set_title(title, fontsize=10)
 

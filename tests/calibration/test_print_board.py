@@ -40,6 +40,18 @@ def test_a_png_has_true_millimetres(tmp_path: Path, text: str, paper: Paper) -> 
     assert ruler == pytest.approx(0.1, abs=1e-4)
 
 
+@pytest.mark.parametrize("text", ["circles:7x5:0.03", "asymmetric_circles:4x11:0.02", "aprilgrid:5x4:0.03:0.3"])
+def test_circles_and_tags_have_true_millimetres(tmp_path: Path, text: str) -> None:
+    board, path = parse_board(text), tmp_path / "board.png"
+    write_target(path, board, "A4")
+    page = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    page = cv2.resize(page, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    points, pixels = board.find(page)
+    assert len(points) >= len(board.corners) / 2
+    wanted = np.linalg.norm(points[1:] - points[0], axis=1)
+    np.testing.assert_allclose(np.linalg.norm(pixels[1:] - pixels[0], axis=1) / 6000, wanted, atol=1e-4)  # m
+
+
 @pytest.mark.parametrize(("text", "paper"), [(DEFAULT_BOARD, "A4"), ("chessboard:8x6:0.025", "letter")])
 def test_a_pdf_has_true_millimetres(tmp_path: Path, text: str, paper: Paper) -> None:
     board, path = parse_board(text), tmp_path / "board.pdf"

@@ -33,6 +33,8 @@ def test_grey_and_deep_images_are_pictures(tmp_path: Path) -> None:
     grey = RGB[0, ..., 0]
     cv2.imwrite(str(tmp_path / "a.png"), grey)
     cv2.imwrite(str(tmp_path / "b.png"), grey.astype(np.uint16) * 257)
+    cv2.imwrite(str(tmp_path / "c.pgm"), grey)
+    assert open_pictures(tmp_path)[1] == 3
     for picture in open_pictures(tmp_path)[0]:
         np.testing.assert_array_equal(picture.rgb, np.repeat(grey[..., None], 3, axis=2))
 
