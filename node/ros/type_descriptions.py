@@ -3,10 +3,8 @@
 from itertools import product
 from typing import Any
 
-from rosbags.interfaces import Nodetype
-
 from node.ros.bus import Bus
-from node.ros.messages import FOLDER, make, type_hash, types
+from node.ros.messages import FOLDER, Nodetype, make, type_hash, types
 
 GET_TYPE_DESCRIPTION = "type_description_interfaces/srv/GetTypeDescription"
 # type_description_interfaces/msg/FieldType
