@@ -29,6 +29,7 @@ ORDER = {
     "The sampler alone": ("sbc", "chains", "acceptance"),
     "What it is worth to a planner": ("reach", "query", "next_view"),
     "Faults": ("stability",),
+    "The camera": ("intrinsics",),
     "Speed": ("kernel", "frontier", "effort", "startup"),
     "The node": ("ingest", "bus", "record"),
 }

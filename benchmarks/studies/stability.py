@@ -149,8 +149,12 @@ def _seen(line: Line) -> Seen:
 
 
 def summary(lines: list[Line], options: Options) -> Summary | None:
-    """Figures of the axes of which every amount was answered for the first `n` views; None where there is none."""
-    seeds = range(options.seed, options.seed + options.seeds)
+    """Figures of the axes of which every amount was answered for the first `n` views; None where there is none.
+
+    Of those seeds that have rows.
+    """
+    known = {line["seed"] for line in lines}
+    seeds = [seed for seed in range(options.seed, options.seed + options.seeds) if seed in known]
     views = objects_of([line for line in lines if line["condition"] == SHIPS])[: options.n]
     by = {(line["condition"], line["object"], line["seed"]): _seen(line) for line in lines}
     pairs = [(view, seed) for seed in seeds for view in views]
@@ -221,7 +225,8 @@ def _tables(axes: Sequence[Axis], of: Figures) -> list[Table]:
             lines.append([
                 axis.name, c, f"{of(c, m, 'hidden_nll'):.3f}", above, f"{of(c, m, 'flagged'):.2f}",
                 f"{of(c, m, 'falsely_free'):.3f} of {of(c, m, 'called_free'):.0f}",
-                f"{of(c, m, 'between_seeds'):.3f}", gated(f"{broken:.3f}", broken, most=0.0),
+                f"{of(c, m, 'between_seeds'):.3f}" if (c, m, "between_seeds") in of else "",
+                gated(f"{broken:.3f}", broken, most=0.0),
             ])  # fmt: skip
     header = (
         "axis", "amount", "hidden_nll, nats", "above as it ships, paired over views", "flagged",
