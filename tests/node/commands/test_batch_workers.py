@@ -65,6 +65,7 @@ def test_a_killed_worker_changes_no_result(given: BatchConfig, deaths: Path, tmp
     assert (tmp_path / "two" / "table.parquet").read_bytes() == (tmp_path / "alone" / "table.parquet").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dask", "how"), [(None, "signal 9 (Killed)"), ("local", "died with it")])
 def test_what_kills_every_worker_is_given_up(
     given: BatchConfig, deaths: Path, tmp_path: Path, dask: str | None, how: str
@@ -89,6 +90,7 @@ def test_a_prior_that_cannot_be_read_ends_it_all(
     assert not list(Path(given.out).rglob("object*"))
 
 
+@pytest.mark.slow
 def test_dask_loses_a_worker_and_no_result(given: BatchConfig, deaths: Path, tmp_path: Path) -> None:
     batch(given, Console(file=io.StringIO()), Console(file=io.StringIO()), here, pretend_estimate)
     (deaths / "1").touch()
