@@ -13,6 +13,8 @@ perturbation delta and without, beside this project's sampler, the encoder alone
   variances).
 - hidden_nll, hidden_ece: of the voxels (32^3) that the given picture does not show, as in `farside bench hidden`.
 
+the prior's gate: z~ is fitted to the solid of held-out objects (`benchmarks.measures.refitted`); iou of 64^3 voxels.
+
 annealing (the paper's figure of an ambulance's rear): vehicles from behind, 8 chains of HMC from the same starts, as
 the paper anneals it and at one temperature with its step of 0.0005. Chains are sorted by psnr_given of their last
 state: best, 4th, worst. `spread` is best less worst.
@@ -34,9 +36,11 @@ from matplotlib.figure import Figure
 from benchmarks.harness.intervals import Figures, gap_rows, mean_rows
 from benchmarks.harness.progress import say
 from benchmarks.harness.results import Line, Results, key, newest
+from benchmarks.harness.rows import Row
 from benchmarks.harness.study import ResumedOptions, Summary, results_of, resumed, selected
-from benchmarks.harness.tables import Table, ranged
+from benchmarks.harness.tables import Table, gated, ranged
 from benchmarks.measures.metrics import psnr
+from benchmarks.measures.refitted import refit
 from benchmarks.paper.cars import Car
 from benchmarks.paper.conditioned import PLACES, Conditioned, base_rate
 from benchmarks.paper.families import FAMILIES, SPLITS, Family
@@ -53,6 +57,7 @@ UNITS = {
 BACK = PLACES["cars"][0]
 ANNEALING = "annealing, cars from behind"
 COMPARED = (HMC, FIXED)
+FIT, GATE, LEAST_IOU = "fit to the solid", "the prior's gate", 0.85
 ORDER = ("best", "4th", "worst", "spread")
 
 
@@ -102,6 +107,7 @@ def main(options: Options) -> Summary:
 
     def measure() -> None:
         for family in families:
+            _gate(options, family, priors[family.name], anew)
             _posteriors(options, family, priors[family.name], anew)
         if "cars" in priors:
             _annealing(options, priors["cars"], anew)
@@ -117,6 +123,18 @@ def main(options: Options) -> Summary:
 
 def _count(options: Options) -> int:
     return 1 if options.quick else min(options.n, 4) if options.small else options.n
+
+
+def _gate(options: Options, family: Family, prior: Prior, results: Results) -> None:
+    for seed in SPLITS["test"][: _count(options)]:
+        line: Line = {
+            "prior": prior.identity, "method": FIT, "settings": {}, "condition": f"{family.name}, {GATE}",
+            "object": seed, "seed": options.seed,
+        }  # fmt: skip
+        if line not in results:
+            iou = round(refit(prior.model, family.name, family.draw(seed).mesh, seed).iou, 4)
+            results.add({**line, "iou": iou})
+            say(f"{line['condition']}, {seed}: iou {iou:.3f}")
 
 
 def _posteriors(options: Options, family: Family, prior: Prior, results: Results) -> None:
@@ -175,11 +193,15 @@ def _annealing(options: Options, prior: Prior, results: Results) -> None:
 
 def summary(lines: list[Line], options: Options) -> Summary | None:
     """Figures of the first `n` objects; None where there are none."""
-    rows, tables = [], []
+    rows: list[Row] = []
+    tables: list[Table] = []
     identities = dict.fromkeys(line["prior"] for line in lines)
     schedule = {m.name: m.settings(options.effort) for m in (*METHODS, FIXED)}
+    schedule[FIT] = {}
     lines = [x for p in identities for x in newest([y for y in lines if y["settings"] == schedule[y["method"]]], p)]
-    for condition in dict.fromkeys(line["condition"] for line in lines if line["condition"] != ANNEALING):
+    if gated_lines := [line for line in lines if line["method"] == FIT and line["object"] in _seeds(options)]:
+        tables.append(_gate_table(gated_lines, rows))
+    for condition in dict.fromkeys(x["condition"] for x in lines if x["condition"] != ANNEALING and x["method"] != FIT):
         own = [line for line in lines if line["condition"] == condition and line["object"] in _seeds(options)]
         cells = []
         for method in [m.name for m in METHODS if any(line["method"] == m.name for line in own)]:
@@ -205,6 +227,18 @@ def summary(lines: list[Line], options: Options) -> Summary | None:
     return Summary(rows, tables, lambda: _draw(Figures(rows))) if rows else None
 
 
+def _gate_table(lines: Sequence[Line], rows: list[Row]) -> Table:
+    cells = []
+    for condition in dict.fromkeys(line["condition"] for line in lines):
+        values = [line["iou"] for line in lines if line["condition"] == condition]
+        rows += mean_rows("paper", FIT, condition, "iou", values, "")
+        mean = Figures(rows).interval(condition, FIT, "iou")
+        cells.append(
+            [condition, str(len(values)), gated(ranged(mean), mean.mean, least=LEAST_IOU), f"{min(values):.3f}"]
+        )
+    return Table("z~ fitted to the solid", ("", "n", f"iou, gate >= {LEAST_IOU:g}", "lowest"), cells)
+
+
 def agreement(anew: Sequence[Line], kept: Sequence[Line]) -> Table:
     """How far rows that were made anew are from the kept ones of the same identity."""
     before, cells = {key(line): line for line in kept}, []
@@ -220,7 +254,7 @@ def _seeds(options: Options) -> range:
     return SPLITS["test"][: _count(options)]
 
 
-def _chain_table(lines: Sequence[Line], rows: list) -> Table:
+def _chain_table(lines: Sequence[Line], rows: list[Row]) -> Table:
     cells = []
     for method in (m.name for m in COMPARED if any(line["method"] == m.name for line in lines)):
         own = [line for line in lines if line["method"] == method]
@@ -238,7 +272,7 @@ def _chain_table(lines: Sequence[Line], rows: list) -> Table:
 
 def _draw(of: Figures) -> Figure:
     """Held-out quality against diversity, and what is said of hidden space, by condition."""
-    conditions = [c for c in of.conditions() if c != ANNEALING]
+    conditions = [c for c in of.conditions() if c != ANNEALING and not c.endswith(GATE)]
     figure = Figure(figsize=(11, 3.4 * max(len(conditions), 1)), layout="constrained")
     axes = figure.subplots(max(len(conditions), 1), 2, squeeze=False)
     for (left, right), condition in zip(axes, conditions, strict=True):

@@ -121,6 +121,7 @@ def test_rows_are_kept_and_summed_up(tmp_path: Path, model: ProbNeRF, monkeypatc
     values |= {"hidden_nll": 0.3, "hidden_ece": 0.05}
     monkeypatch.setattr(paper, "judge", lambda *_: SimpleNamespace(values=values))
     monkeypatch.setattr(paper, "base_rate", lambda *_: None)
+    monkeypatch.setattr(paper, "refit", lambda *_: SimpleNamespace(iou=0.9))
     tints = np.linspace(0.0, 1.0, 8)[:, None, None, None, None]
     monkeypatch.setattr(paper, "pictures", lambda *_: np.broadcast_to(tints, (8, 1, SIZE, SIZE, 3)))
     asked: list[str] = []
@@ -136,7 +137,9 @@ def test_rows_are_kept_and_summed_up(tmp_path: Path, model: ProbNeRF, monkeypatc
     options = {"quick": True, "families": "cars;bodies", "results": tmp_path / "kept.jsonl"}
     found = main(Options(tmp_path, **options))
     assert asked == ["hmc", "the prior alone"] * 2
-    assert [t.title for t in found.tables][:2] == ["cars, back", "cars, three-quarter view"]
+    titles = [t.title for t in found.tables]
+    assert titles[:3] == ["z~ fitted to the solid", "cars, back", "cars, three-quarter view"]
+    assert "0.900" in found.tables[0].lines[0][2] and found.tables[0].lines[0][2].endswith("pass")
     value = {(r.condition, r.method, r.metric): r.value for r in found.rows}
     assert value["cars, back", "hmc", "hidden_nll_above_hmc"] == 0.0
     assert value[ANNEALING, "hmc", "psnr_given, best"] > value[ANNEALING, "hmc", "psnr_given, worst"]
