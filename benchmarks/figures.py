@@ -83,12 +83,12 @@ def picture(name: str, summary: Summary) -> None:
 def page(drawn: Callable[[str, Summary], None] | None = None) -> str:
     """The text of docs/figures.md; `drawn` is given every summary that is made from rows."""
     transcription = tomllib.loads((FOLDER / "transcribed.toml").read_text(encoding="utf-8"))
-    links = (f"[{title}](#{title.lower().replace(' ', '-')})" for title in ORDER)
-    parts = [INTRODUCTION, f"Contents: {' · '.join(links)}\n"]
+    parts, links = [], []
     for title, names in ORDER.items():
-        sections = [section for name in names if (section := _section(name, transcription, drawn))]
-        parts += [f"## {title}\n", *sections] if sections else []
-    return "\n".join(parts)
+        if sections := [section for name in names if (section := _section(name, transcription, drawn))]:
+            parts += [f"## {title}\n", *sections]
+            links.append(f"[{title}](#{title.lower().replace(' ', '-')})")
+    return "\n".join([INTRODUCTION, f"Contents: {' · '.join(links)}\n", *parts])
 
 
 def _section(name: str, transcription: dict[str, Any], drawn: Callable[[str, Summary], None] | None) -> str:

@@ -103,9 +103,11 @@ class Store:
         return {path[start:]: int(info["size"] or 0) for path, info in sorted(found.items())}
 
     def remove(self, name: str) -> None:
-        """Remove a file that is there. Raises `StoreError`."""
+        """Remove a file, unless another process did. Raises `StoreError`."""
         try:
             self._files.rm_file(self._place(name))
+        except FileNotFoundError:
+            return
         except Exception as error:
             raise StoreError(f"{self.path(name)} cannot be removed ({one_line(error)})") from None
 
@@ -132,7 +134,8 @@ def entries(url: str) -> dict[str, bool] | None:
     try:
         if not files.isdir(path):
             return None
-        found = {each["name"]: each["type"] == "directory" for each in files.ls(path, detail=True)}
+        kinds = {each["name"]: each["type"] for each in files.ls(path, detail=True)}  # "other": behind a link
+        found = {name: kind == "directory" or (kind == "other" and files.isdir(name)) for name, kind in kinds.items()}
     except Exception as error:
         raise StoreError(f"{url} cannot be listed ({one_line(error)})") from None
     return {_named(files, each): found[each] for each in sorted(found)}

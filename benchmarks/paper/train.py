@@ -28,8 +28,8 @@ class Options:
 
     family: Literal["cars", "bodies"] = "cars"
     """What it learns."""
-    out: Path = Path("runs/paper-cars")
-    """Folder of the run."""
+    out: Path | None = None
+    """Folder of the run; runs/paper-FAMILY by default."""
     preset: Literal["small", "paper", "tiny"] = "small"
     """Sizes of the model."""
     objects: int = 2458
@@ -49,9 +49,10 @@ def main(options: Options) -> Path:
     """Train, or go on; the path of the weights."""
     family, seeds = FAMILIES[options.family], SPLITS["train"]
     preset = PRESETS[options.preset]
-    kept = options.out / f"shapes-{options.objects}.npz"
+    out = options.out or Path(f"runs/paper-{family.name}")
+    kept = out / f"shapes-{family.name}-{options.objects}.npz"
     if not kept.exists():
-        options.out.mkdir(parents=True, exist_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
         shape_set(
             family, seeds[: options.objects], lambda done, of: None if done % 200 else say(f"{done} of {of}")
         ).save(kept)
@@ -61,9 +62,9 @@ def main(options: Options) -> Path:
     model = ProbNeRF(preset, np.array([0, options.recipe.seed], np.uint32))  # type: ignore[arg-type]
     likelihood = Likelihood(lattice=foam.Lattice(preset.lattice, 1.0, 9 * preset.lattice // 4))
     state = None
-    for state, metrics in elbo.train(model, [(solids, 1.0)], views, likelihood, options.recipe, options.out):  # noqa: B007
+    for state, metrics in elbo.train(model, [(solids, 1.0)], views, likelihood, options.recipe, out):  # noqa: B007
         say("  ".join(f"{name} {value:.5g}" for name, value in metrics.items()))
-    weights = options.out / "prior.safetensors"
+    weights = out / "prior.safetensors"
     if state is not None:
         story = {
             "family": family.name,

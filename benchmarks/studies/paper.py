@@ -1,8 +1,8 @@
-"""The ProbNeRF paper's experiments on this project's own code: posterior inference and annealing, on cars and bodies.
+"""The ProbNeRF paper's experiments on this project's own code: posterior inference and annealing, on cars.
 
 Objects of the test seeds of `benchmarks.paper.families`, of known pose, each from a telling and from an untelling place
-(`benchmarks.paper.conditioned`); one colour picture and no depth. Priors of both families were trained by
-`python -m benchmarks.paper.train`.
+(`benchmarks.paper.conditioned`); one colour picture and no depth. The prior was trained by
+`python -m benchmarks.paper.train`. A family whose prior is not there (people) is left out.
 
 posterior inference (the paper's figure of ablations): HMC as in the paper and mean-field VI, each with the weights'
 perturbation delta and without, beside this project's sampler, the encoder alone and the prior alone.
@@ -63,7 +63,7 @@ ORDER = ("best", "4th", "worst", "spread")
 
 @dataclass(frozen=True)
 class Options(ResumedOptions):
-    """The paper's experiments: posterior inference and annealing, on cars and bodies."""
+    """The paper's experiments: posterior inference and annealing, on cars."""
 
     full: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """The paper's own schedules; without, shorter ones for two cores."""
@@ -100,7 +100,9 @@ def main(options: Options) -> Summary:
     _ = selected(options.methods, [m.name for m in METHODS], "method")
     results, families = results_of("paper", options), options.chosen
     if not families:
-        raise ValueError(f"{WEIGHTS} holds no prior; train one with `python -m benchmarks.paper.train --family cars`")
+        raise ValueError(
+            f"{WEIGHTS} holds no prior; train one with `python -m benchmarks.paper.train`, and copy it there"
+        )
     priors = {family.name: load_prior(weights_of(family)) for family in families}
 
     anew = Results(options.out / "paper-small.jsonl") if options.small else results

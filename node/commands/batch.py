@@ -113,6 +113,8 @@ class _Work:
         for log in self._seeds:
             if (record := records.get(log)) is None:
                 tasks += self._open([Task(log)])
+            elif not isinstance(record, dict) or not isinstance(record.get("bytes"), int):
+                raise ValueError(f"{self._store.path(Task(log).done)} is damaged; remove it, and it is made again")
             elif record["bytes"] != sizes[log]:
                 raise ValueError(
                     f"{log} has changed since its objects were found ({record['bytes']} bytes then, {sizes[log]} now);"
@@ -244,7 +246,7 @@ def _claimed(store: Store, settings: dict[str, Any]) -> str:
             before, after = dict(_leaves(json.loads(kept))), dict(_leaves(json.loads(text)))
         except ValueError:
             raise ValueError(f"{store.path(SETTINGS)} is damaged; give another --out") from None
-        name = next(name for name in sorted(before | after) if before.get(name) != after.get(name))
+        name = next(name for name in sorted(before | after) if before.get(name, ...) != after.get(name, ...))
         raise ValueError(
             f"{store.url} holds results with {name} {before.get(name)}, and this is {after.get(name)}; give that, or"
             " another --out"

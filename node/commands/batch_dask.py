@@ -63,6 +63,8 @@ def run_dask(
                 yield Event(task, None, f"worker {error.last_worker.address} died with it", TRIES)
             except StoreError as error:
                 yield Event(task, None, one_line(error), TRIES)
+            except Exception as error:  # a worker with another Farside, or a scheduler that went away
+                yield Event(task, None, f"{type(error).__name__}: {one_line(error)[:300]}", TRIES)
             else:
                 new = submitted(then(task, record), 1)  # units before further logs: the log's frame is still at hand
                 waiting |= new

@@ -109,7 +109,7 @@ class Worker:
             "label": h.label,
             "seed": h.seed,
             "result": str(h.result),
-            "kinds": {name: float(p) for name, p in h.kinds.items()},
+            "kinds": {name: _number(p) for name, p in h.kinds.items()},
             "size_m": [round(float(length), 6) for length in size(h)],
             "out_of_model": bool(h.out_of_model),
             "explained": _number(h.diagnostics.explained),

@@ -181,7 +181,7 @@ def report(
         "distortion": ", ".join(
             _pm(value, s, 4) for value, s in zip(camera.distortion, camera.distortion_std, strict=True)
         ),
-        "board": f"bent by {1000 * result.bend.depth(result.views[0].view.points):.1f} mm",
+        "board": f"bent by {1000 * result.bend.depth(np.concatenate([v.view.points for v in result.views])):.1f} mm",
         "coverage": str(seen),
     }
     if misses is not None:

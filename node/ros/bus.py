@@ -9,6 +9,7 @@ import json
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -94,7 +95,7 @@ class Bus:
         self._meeting = threading.Lock()  # of who is there; held for moments, as zenoh's own threads take it
         self._others: dict[str, Entity] = {}  # of other nodes, by token
         self._clients: dict[tuple[str, str], bytes] = {}
-        self._sequence = 0
+        self._called = Counter[tuple[str, str]]()  # a client's requests are numbered
         self._lock = threading.Lock()
 
     def __enter__(self) -> Self:
@@ -212,8 +213,7 @@ class Bus:
             if (name, kind) not in self._clients:
                 self._clients[name, kind] = gid(self._entity("SC", name, kind, quality(10))[2])
             source = self._clients[name, kind]
-            self._sequence += 1
-            sequence = self._sequence
+            sequence = self._called[name, kind] = self._called[name, kind] + 1
         where = key(self.config.domain_id, name, kind, type_hash(kind))
         data, deadline = encode(request), time.monotonic() + timeout_s
         while (left := deadline - time.monotonic()) > 0:

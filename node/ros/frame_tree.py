@@ -33,6 +33,9 @@ class _Edge:
         if self.stamps and stamp < self.stamps[-1] - KEPT_NS:  # a recording that began again
             self.stamps, self.places = [], []
         at = bisect_left(self.stamps, stamp)
+        if at < len(self.stamps) and self.stamps[at] == stamp:
+            self.places[at] = T
+            return
         self.stamps.insert(at, stamp)
         self.places.insert(at, T)
         old = bisect_left(self.stamps, self.stamps[-1] - KEPT_NS)
@@ -66,6 +69,7 @@ class FrameTree:
     def __init__(self, bus: Bus | None = None) -> None:
         """With a bus it listens to the two topics."""
         self._edges: dict[str, _Edge] = {}
+        self._own = plain(bus.node.resolve("~/object_")) if bus is not None else None  # frames that the node publishes
         self._lock = threading.Lock()
         if bus is not None:
             bus.subscribe("/tf", TRANSFORMS, self.take, depth=100)
@@ -76,6 +80,8 @@ class FrameTree:
         trouble = ""
         for it in message.transforms:
             child, parent = plain(it.child_frame_id), plain(it.header.frame_id)
+            if self._own is not None and child.startswith(self._own):
+                continue
             try:
                 T = matrix(SimpleNamespace(position=it.transform.translation, orientation=it.transform.rotation))
             except ValueError as error:

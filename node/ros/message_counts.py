@@ -9,20 +9,23 @@ from collections.abc import Callable
 class MessageCounts:
     """Counts of messages by topic or service and fate: sent, received, dropped, too_large, too_fast, malformed, failed,
     refused, other_type.
-    The first fault of each kind is reported in a line.
+    The first fault of each kind that has words is reported in a line.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say, self._lock = say, threading.Lock()
         self._counts: dict[str, Counter[str]] = {}
+        self._told: set[tuple[str, str]] = set()
 
     def add(self, name: str, fate: str, trouble: str = "", count: int = 1) -> None:
         """Count a fate; `trouble` is reported if it is the first of its kind."""
         with self._lock:
             counter = self._counts.setdefault(name, Counter())
-            first = counter[fate] == 0
             counter[fate] += count
-        if first and trouble:
+            first = bool(trouble) and (name, fate) not in self._told
+            if first:
+                self._told.add((name, fate))
+        if first:
             self._say(f"{name}: {trouble} (further ones are only counted)")
 
     def of(self, name: str) -> dict[str, int]:

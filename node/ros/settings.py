@@ -30,7 +30,7 @@ class BusConfig:
     allowed: tuple[str, ...] = ()  # common names of admitted certificates; empty: all that TLS admits
     max_message_bytes: int = 64_000_000
     max_request_bytes: int = 4_000_000  # of a service's request
-    max_rate: float = 200.0  # messages per second of each topic and service, in and out
+    max_rate: float = 200.0  # messages per second of each topic, and of each sender on a topic or service
     use_sim_time: bool = False  # ages and diagnostics are by the time on /clock, of a simulation or a recording
 
     def __post_init__(self) -> None:

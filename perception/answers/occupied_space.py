@@ -16,6 +16,7 @@ from perception.answers.query import marginal
 from probnerf.rendering.occupancy import above_plane, coarsen, voxel_centres
 
 MAX_CELLS = 15_000_000  # of a distance field
+MAX_SAMPLES = 20_000_000  # of an object's voxels
 
 
 def risky_surface(
@@ -57,10 +58,15 @@ def cells(
 
     Cells are cubes of `width` (m) along a frame's axes; cell (i, j, k) begins at width (i, j, k). A voxel is sampled so
     densely that no cell that lies within the mask is left out: a lattice of step s has a point in every cube with edges
-    of sqrt(3) s, however that is turned.
+    of sqrt(3) s, however that is turned. Raises ValueError for more than MAX_SAMPLES samples.
     """
     index = np.flatnonzero(mask)
     parts = int(np.ceil(np.sqrt(3.0) * h.voxel_m / width * (1 - 1e-9)))
+    if len(index) * parts**3 > MAX_SAMPLES:
+        raise ValueError(
+            f"cells of {1000 * width:.2g} mm are too narrow for voxels of {1000 * h.voxel_m:.2g} mm: {len(index)} of"
+            f" these would need {parts**3} samples each; ask for wider cells"
+        )
     offset = ((np.arange(parts) + 0.5) / parts - 0.5) * 2.0 / h.grid
     offsets = np.stack(np.meshgrid(offset, offset, offset), axis=-1).reshape(-1, 3)
     centres = voxel_centres(h.grid).reshape(-1, 3)[index].astype(np.float64)

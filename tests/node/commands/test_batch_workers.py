@@ -66,14 +66,11 @@ def test_a_killed_worker_changes_no_result(given: BatchConfig, deaths: Path, tmp
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("dask", "how"), [(None, "signal 9 (Killed)"), ("local", "died with it")])
-def test_what_kills_every_worker_is_given_up(
-    given: BatchConfig, deaths: Path, tmp_path: Path, dask: str | None, how: str
-) -> None:
+def test_what_kills_every_worker_is_given_up(given: BatchConfig, deaths: Path, tmp_path: Path) -> None:
     for n in range(TRIES):
         (deaths / str(n)).touch()
-    code, text = run(replace(given, logs=(f"{given.logs[0]}/a",), dask=dask))
-    assert code == FAILED and "1 units done, 0 were there, 1 failed" in text and f"{how}; given up" in text
+    code, text = run(replace(given, logs=(f"{given.logs[0]}/a",)))
+    assert code == FAILED and "1 units done, 0 were there, 1 failed" in text and "signal 9 (Killed); given up" in text
     assert not list(deaths.iterdir())
     alive, dead = pq.read_table(tmp_path / "alone" / "table.parquet").to_pylist()
     assert alive["result"] == "converged" and dead["error"].startswith("given up after 3 tries: ")
