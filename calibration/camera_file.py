@@ -1,4 +1,7 @@
-"""Camera files: the YAML that ROS's camera_info_manager writes and reads, with the calibration's uncertainty."""
+"""Camera files: the YAML that ROS's camera_info_manager writes and reads, with the calibration's uncertainty.
+
+Kalibr's chains and the archives of ROS's cameracalibrator are read, too.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,6 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from calibration.camchain import camera_of_chain, is_chain
 from calibration.camera import Camera
 from calibration.projection import Projection
 from foundation.bounded import check_size
@@ -50,8 +54,24 @@ def write_camera(path: Path, camera: Camera, name: str = "camera", misses: Proje
     write_whole(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120))
 
 
+def is_camera_file(path: Path) -> bool:
+    """Whether the name is a camera file's, with or without #NAME."""
+    return split_name(path)[0].name.lower().endswith((".yaml", ".yml"))
+
+
+def split_name(path: Path) -> tuple[Path, str | None]:
+    """The file and the camera's name of FILE#NAME. A file that exists under the whole name is that file."""
+    file, hash_, name = str(path).rpartition("#")
+    return (path, None) if not hash_ or not name or "/" in name or path.exists() else (Path(file), name)
+
+
 def read_camera(path: Path) -> Camera:
-    """The camera in a YAML file of ROS's or ours. Raises FileNotFoundError, or ValueError naming file and remedy."""
+    """The camera in a YAML file of ROS's or ours, or one of a chain in Kalibr's camchain.yaml.
+
+    Of a chain, FILE#cam1 is its camera cam1, and FILE alone cam0. Raises FileNotFoundError, or ValueError naming file
+    and remedy.
+    """
+    path, name = split_name(path)
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
         check_size(content)
@@ -59,6 +79,13 @@ def read_camera(path: Path) -> Camera:
         raise FileNotFoundError(f"{path}: no such camera file; `farside calibrate` writes one") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not YAML ({one_line(error)}); calibrate again") from None
+    if is_chain(content):
+        try:
+            return camera_of_chain(content, name)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+    if name is not None:
+        raise ValueError(f"{path} is not a chain of cameras (Kalibr's, with cam0, cam1, ...); omit #{name}")
     try:
         if not isinstance(content, Mapping):
             raise ValueError("it has no keys")

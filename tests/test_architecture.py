@@ -35,7 +35,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     "foundation": (("bounded", "one_line", "whole_file"), ("store",)),
     "calibration": (
         ("boards", "camera", "deviations", "turntable"),
-        ("fit", "print_board", "turntable_pose"),
+        ("camchain", "fit", "print_board", "turntable_pose"),
         ("calibrate", "camera_file", "coverage", "projection"),
     ),
     "probnerf": (

@@ -12,7 +12,7 @@ from rich.table import Table
 from calibration.boards import DEFAULT_BOARD, Board, parse_board
 from calibration.calibrate import CalibrateConfig, Calibration, calibrate, distinct, motion
 from calibration.camera import Camera
-from calibration.camera_file import read_camera, write_camera
+from calibration.camera_file import is_camera_file, read_camera, write_camera
 from calibration.coverage import Coverage, coverage, next_views
 from calibration.fit import BoardView
 from calibration.print_board import Paper, write_target
@@ -210,7 +210,7 @@ def copy_camera(options: Calibrate, source: Path, out: Console) -> None:
     Raises ValueError, one line.
     """
     check_output(options.out)
-    if source.suffix.lower() in (".yaml", ".yml"):
+    if is_camera_file(source):
         camera = read_camera(source)
     elif source.suffix.lower() == ".json":
         from perception.sources.oak import camera_of_device_json  # here, because depthai takes a second to import

@@ -43,7 +43,7 @@ class FrameOptions:
     camera: Annotated[
         Path | None, arg(metavar="FILE.yaml", help_behavior_hint="(default: the intrinsics in the source)")
     ] = None
-    """Calibration of the colour image (as `farside calibrate` writes it) to use in place of the recorded intrinsics."""
+    """Colour camera in place of the recorded one: `farside calibrate`'s, ROS's or Kalibr's file (FILE.yaml#cam1)."""
     colour_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
     """Colour image of a recording that has several."""
     depth_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
@@ -150,7 +150,7 @@ class LiveConfig:
     camera: Annotated[
         Path | None, arg(metavar="FILE.yaml", help_behavior_hint="(default: the source's own intrinsics)")
     ] = None
-    """Calibration of the colour image, as `farside calibrate` writes it."""
+    """Colour camera's calibration: `farside calibrate`'s, ROS's or Kalibr's file (FILE.yaml#cam1)."""
     colour_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
     """Colour image of a recording that has several."""
     depth_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
