@@ -3,6 +3,7 @@
 Kalibr's chains and the archives of ROS's cameracalibrator are read, too.
 """
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import yaml
 from calibration.camchain import camera_of_chain, is_chain
 from calibration.camera import Camera
 from calibration.projection import Projection
+from foundation.archive import is_archive, members
 from foundation.bounded import check_size
 from foundation.one_line import one_line
 from foundation.whole_file import write_whole
@@ -56,7 +58,8 @@ def write_camera(path: Path, camera: Camera, name: str = "camera", misses: Proje
 
 def is_camera_file(path: Path) -> bool:
     """Whether the name is a camera file's, with or without #NAME."""
-    return split_name(path)[0].name.lower().endswith((".yaml", ".yml"))
+    file = split_name(path)[0]
+    return is_archive(file) or file.suffix.lower() in (".yaml", ".yml")
 
 
 def split_name(path: Path) -> tuple[Path, str | None]:
@@ -66,14 +69,16 @@ def split_name(path: Path) -> tuple[Path, str | None]:
 
 
 def read_camera(path: Path) -> Camera:
-    """The camera in a YAML file of ROS's or ours, or one of a chain in Kalibr's camchain.yaml.
+    """The camera in a YAML file of ROS's or ours, in Kalibr's camchain.yaml, or in ROS's calibrationdata.tar.gz.
 
-    Of a chain, FILE#cam1 is its camera cam1, and FILE alone cam0. Raises FileNotFoundError, or ValueError naming file
+    Of a chain, FILE#cam1 is its camera cam1, and FILE alone cam0. Of an archive, FILE alone is ost.yaml (of one
+    camera) or left.yaml, and FILE#right is right.yaml. Raises FileNotFoundError, or ValueError naming file
     and remedy.
     """
     path, name = split_name(path)
+    archived = _archived(path, name) if is_archive(path) else None
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.safe_load(path.read_text(encoding="utf-8") if archived is None else archived.decode())
         check_size(content)
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise FileNotFoundError(f"{path}: no such camera file; `farside calibrate` writes one") from None
@@ -84,7 +89,7 @@ def read_camera(path: Path) -> Camera:
             return camera_of_chain(content, name)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-    if name is not None:
+    if name is not None and archived is None:
         raise ValueError(f"{path} is not a chain of cameras (Kalibr's, with cam0, cam1, ...); omit #{name}")
     try:
         if not isinstance(content, Mapping):
@@ -103,6 +108,14 @@ def read_camera(path: Path) -> Camera:
         )
     except (AttributeError, OverflowError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is no camera file: {error}; calibrate again") from None
+
+
+def _archived(path: Path, name: str | None) -> bytes:
+    wanted = re.compile(rf"{re.escape(name)}\.yaml" if name else r"(ost|left)\.yaml")
+    for _, data in members(path, wanted):
+        return data
+    what = f"{name}.yaml" if name else "ost.yaml or left.yaml"
+    raise ValueError(f"{path} holds no {what}; give the archive that ROS's cameracalibrator saved")
 
 
 def _matrix(values: np.ndarray) -> dict[str, Any]:

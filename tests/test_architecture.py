@@ -32,7 +32,7 @@ PACKAGES = ("foundation", "calibration", "probnerf", "perception", "node", "fars
 # Inside a folder: its rooms and files from the lowest layer to the highest. Each may import its own layer and those
 # before it; circles are excluded by a test of their own.
 LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
-    "foundation": (("bounded", "one_line", "whole_file"), ("store",)),
+    "foundation": (("bounded", "one_line", "whole_file"), ("archive", "store")),
     "calibration": (
         ("boards", "camera", "deviations", "turntable"),
         ("camchain", "fit", "print_board", "turntable_pose"),

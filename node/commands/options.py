@@ -270,7 +270,7 @@ class Calibrate:
     source: Annotated[
         Positional[str | None], arg(metavar="[SOURCE]", help_behavior_hint="(this, --from or --print-target)")
     ] = None
-    """Folder of images, recording with a colour image (needs no camera_info), video, or camera: oak, webcam:N."""
+    """Images (folder, or ROS's calibrationdata.tar.gz), recording (needs no camera_info), video, or oak, webcam:N."""
     board: Annotated[
         str | None, arg(metavar="BOARD", help_behavior_hint="(default: charuco:7x5:0.035:0.026:DICT_5X5_100)")
     ] = None

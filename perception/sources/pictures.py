@@ -1,12 +1,15 @@
 """Plain colour pictures for calibration: from a folder of images or any source. Their camera need not be known."""
 
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Shaped, UInt8
 
+from calibration.camera_file import split_name
+from foundation.archive import is_archive, members
 from perception.sources.frame import Frame, Source
 from perception.sources.image_files import colour_to_rgb, decoded, read_png
 from perception.sources.log_messages import first_messages, open_log
@@ -37,10 +40,15 @@ def open_pictures(source: Path | str) -> tuple[Iterator[Picture], int | None]:
     """The pictures of `source` and their number; None for those of a stream.
 
     `source` is a folder of images (in the order of their names), one image, a recording with a colour image (its
-    camera_info, depth and labels are not read), or else what `open_source` opens. A live source gives its newest
-    picture each time, until it ends. Raises FileNotFoundError, OSError or ValueError naming the source and the remedy.
+    camera_info, depth and labels are not read), the calibrationdata.tar.gz of ROS's cameracalibrator (its left-*.png;
+    FILE#right: right-*.png), or else what `open_source` opens. A live source gives
+    its newest picture each time, until it ends. Raises FileNotFoundError, OSError or ValueError naming the source and
+    the remedy.
     """
     path = Path(source)
+    archive, camera = split_name(path)
+    if is_archive(archive):
+        return _archived(archive, camera or "left")
     if str(source).partition(":")[0] in ("oak", "webcam") or path.suffix in VIDEO_SUFFIXES or not path.exists():
         opened = open_source(source)
         return _newest(opened) if opened.live else pictures_of(opened), None
@@ -62,6 +70,14 @@ def _newest(source: Source) -> Iterator[Picture]:
             yield Picture(f"frame {reader.counts().received - 1}", frame.rgb)
 
 
+def _archived(path: Path, camera: str) -> tuple[Iterator[Picture], int]:
+    wanted = re.compile(rf"{re.escape(camera)}-\d+\.png")
+    count = sum(1 for _ in members(path, wanted))
+    if not count:
+        raise ValueError(f"{path} holds no {camera}-0000.png; give the archive that ROS's cameracalibrator saved")
+    return (Picture(name, _colours(f"{path}: {name}", data)) for name, data in members(path, wanted)), count
+
+
 def _logged(path: Path) -> Iterator[Picture]:
     read, kinds, _ = open_log(path)
     firsts = first_messages(read, {topic: kind for topic, kind in kinds.items() if kind in _IMAGES})
@@ -75,14 +91,21 @@ def _logged(path: Path) -> Iterator[Picture]:
 
 def _read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     if path.suffix.lower() == ".png":
-        image = read_png(path)
-    else:
-        try:
-            image = decoded(path.read_bytes())
-        except ValueError as error:
-            raise ValueError(f"{path} cannot be decoded ({error}); copy it again, or remove it") from None
+        return _eight_bits(str(path), read_png(path))
+    return _colours(str(path), path.read_bytes())
+
+
+def _colours(name: str, data: bytes) -> UInt8[np.ndarray, "h w 3"]:
+    try:
+        image = decoded(data)
+    except ValueError as error:
+        raise ValueError(f"{name} cannot be decoded ({error}); copy it again, or remove it") from None
+    return _eight_bits(name, image)
+
+
+def _eight_bits(name: str, image: Shaped[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w 3"]:
     if image.dtype == np.uint16:  # depth, or a camera's raw grey
         image = (image >> 8).astype(np.uint8)
     if image.dtype != np.uint8:
-        raise ValueError(f"{path} has {image.dtype} samples; save it with 8 bits a channel")
+        raise ValueError(f"{name} has {image.dtype} samples; save it with 8 bits a channel")
     return colour_to_rgb(image)
