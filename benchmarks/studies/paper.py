@@ -287,6 +287,8 @@ def _draw(of: Figures) -> Figure:
             left.errorbar(x, y.mean, [[y.mean - y.low], [y.high - y.mean]], fmt=mark, color=f"C{k}", label=method)
             nll = of.interval(condition, method, "hidden_nll")
             right.errorbar(nll.mean, k, xerr=[[nll.mean - nll.low], [nll.high - nll.mean]], fmt=mark, color=f"C{k}")
+        left.set_ylim(5.0, 35.0)  # intervals of few objects reach farther
+        right.set_xlim(0.0, 2.0)
         left.set(title=condition, xlabel="sd of held-out pixels between draws", ylabel="psnr of held-out views, dB")
         left.legend(fontsize=8)
         right.set(xlabel="hidden_nll, nats (lower is better)", yticks=range(len(of.methods(condition))))
