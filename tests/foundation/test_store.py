@@ -99,3 +99,20 @@ def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match=r"is a file; give a folder|is a file, or in one"):
         Store(str(tmp_path / "file" / "out")).check()
+
+
+def test_what_another_removed_is_no_fault(url: str) -> None:
+    store = Store(url)
+    store.write("a.json", b"{}")
+    store.remove("a.json")
+    store.remove("a.json")
+    assert not store.has("a.json")
+
+
+def test_a_folder_behind_a_link_is_one(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "link").symlink_to(tmp_path / "there")
+    (tmp_path / "logs" / "file.mcap").write_bytes(b"x")
+    found = entries(str(tmp_path / "logs"))
+    assert found is not None and list(found.values()) == [False, True]

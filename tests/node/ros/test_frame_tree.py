@@ -117,3 +117,18 @@ def test_it_listens_to_both_topics() -> None:
         while not (tree.knows("map") and tree.knows("camera")) and time.monotonic() < deadline:
             time.sleep(0.02)
         np.testing.assert_allclose(tree.T("map", "camera", START), place(2.0) @ place(1.0), atol=1e-12)
+
+
+def test_equal_stamps_take_no_room_and_the_last_counts() -> None:
+    tree = FrameTree()
+    for n in range(50):
+        tree.take(frames(("base_link", "arm", place(float(n)))))
+    assert len(tree._edges["arm"].stamps) == 1
+    np.testing.assert_allclose(tree.T("base_link", "arm", START)[0, 3], 49.0)
+
+
+def test_the_node_s_own_objects_are_no_frames_of_the_robot() -> None:
+    with Bus(BusConfig()) as bus:
+        tree = FrameTree(bus)
+        tree.take(frames(("camera", "farside/object_1", place(1.0)), ("base_link", "camera", place(0.0))))
+        assert tree.knows("camera") and not tree.knows("farside/object_1")

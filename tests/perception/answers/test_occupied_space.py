@@ -122,3 +122,9 @@ def test_a_box_without_content_is_refused(box: tuple) -> None:
         distance_field([body_with_handle()], np.eye(4), box, 0.05, 0.01)
     with pytest.raises(ValueError, match=f"ask for at most {MAX_CELLS}"):
         distance_field([body_with_handle()], np.eye(4), ((0, 0, 0), (9, 9, 9)), 0.05, 0.01)
+
+
+def test_cells_too_narrow_for_the_voxels_are_refused() -> None:
+    h = body_with_handle()
+    with pytest.raises(ValueError, match="ask for wider cells"):
+        cells(h, np.ones(h.grid**3, bool), np.eye(4), h.voxel_m / 100)
