@@ -101,6 +101,7 @@ def _meshes(folder: Path) -> Sequence[tuple[str, trimesh.Trimesh]]:
 
 
 def tabletop_objects(seeds: np.ndarray) -> list[LearntObject]:
+    """The tabletop family's objects of these seeds, as meshes with their own colours."""
     shapes, made = tabletop_shapes(seeds), []
     for row, seed in enumerate(seeds):
         obj = sample_object(int(seed))
