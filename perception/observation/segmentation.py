@@ -87,7 +87,8 @@ def segment(frame: Frame, object_id: int | None = None, config: SegmentConfig | 
     """
     config = config or SegmentConfig()
     try:
-        _check_camera(frame)
+        if config.whole:
+            _check_camera(frame)
         if frame.depth is None:
             return Segments(tuple(_segment_colour(frame, object_id, config)))
         return _segment_depth(frame, object_id, config)

@@ -79,6 +79,7 @@ class SegmentConfig:
     rim: int = 2  # px on each side of a mask's outline that are UNKNOWN: mixed pixels, misregistered depth
     mask: MaskConfig = field(default_factory=MaskConfig)  # without depth
     guess: PlaneGuess = field(default_factory=PlaneGuess)  # without depth
+    whole: bool = True  # the picture is the camera's whole one: its principal point lies within
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

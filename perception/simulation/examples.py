@@ -17,7 +17,7 @@ from perception.observation.encoder_crop import crop
 from perception.observation.object_frame import ObjectFrame, object_frame
 from perception.observation.rays import pose_widths
 from perception.observation.segmentation import Segment, segment
-from perception.observation.settings import ObserveConfig
+from perception.observation.settings import ObserveConfig, SegmentConfig
 from perception.simulation.mesh_scene import MeshShape, PlacedMesh, render_meshes
 from perception.simulation.sensor_draws import draw_sensor, on_mistaken_plane, told_pose
 from perception.simulation.sensor_faults import sense
@@ -26,6 +26,7 @@ from perception.sources.frame import Frame
 from probnerf.prior.posterior_network import EncoderPicture
 from probnerf.types import BASE_Z, POSE_SIZE
 
+_WINDOW = SegmentConfig(whole=False)  # pictures are windows of larger ones
 _SAME = 0.5  # intersection over union with the true mask from which a segment is the object
 
 
@@ -77,7 +78,9 @@ def example_of(
     T_camera_object = np.linalg.inv(frame.T_world_camera) @ placed.T_world_object
     seen = frame if frame.depth is not None else replace(frame, T_world_camera=told_pose(frame.T_world_camera, rng))
     try:
-        found = _found(seen, object_id) if own_mask and frame.depth is not None else segment(seen, object_id)[0]
+        found = (
+            _found(seen, object_id) if own_mask and frame.depth is not None else segment(seen, object_id, _WINDOW)[0]
+        )
         if wrong_plane and frame.depth is not None:
             found = on_mistaken_plane(found, T_camera_object[:3, 3], rng)
         if pose_known:
@@ -155,7 +158,7 @@ def _found(frame: Frame, object_id: int) -> Segment:
     """Perception's own segment of a labelled object. Raises `ValueError` where it finds none."""
     assert frame.label is not None
     true = frame.label == object_id
-    segments = segment(replace(frame, label=None))
+    segments = segment(replace(frame, label=None), config=_WINDOW)
     overlap = [(s.mask & true).sum() / (s.mask | true).sum() for s in segments]
     if max(overlap) < _SAME:
         raise ValueError("perception's own segments miss the object or join it with others")

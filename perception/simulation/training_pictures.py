@@ -4,18 +4,16 @@ They are drawn in parts, each a file that depends on its number alone, so that d
 depend on the prior: a part holds each object's description, from which the prior's recognition tells its latents.
 """
 
-import multiprocessing
-import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from concurrent.futures import as_completed
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
 from foundation.whole_file import whole_file
+from foundation.worker_pool import worker_pool
 from perception.simulation.examples import Example, ExampleDraws, draw_example
 from perception.simulation.mesh_scene import MeshShape
 from perception.simulation.plain_pictures import PlainDraws, TrainingPicture, draw_plain
@@ -28,11 +26,6 @@ OBJECTS, VIEWS = 64, 2  # of a part; many views of few objects teach a network t
 PLAIN_OBJECTS, PLAIN_VIEWS = 256, 6  # of a part of plain pictures
 PLAIN = PLAIN_OBJECTS * PLAIN_VIEWS
 LOOKS = ViewDraws(focal=(180.0, 420.0))  # pictures are shrunk anyway; coarser ones are drawn faster
-_ONE_THREAD = {  # of each process; and none of them takes an accelerator's memory
-    "JAX_PLATFORMS": "cpu",
-    "OMP_NUM_THREADS": "1",
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +98,13 @@ def draw_plain_part(
 ) -> PicturePart:
     """One part of plain pictures (`plain_pictures`)."""
     rng = np.random.default_rng([number, 73])
-    things = draw_objects(rng, objects, families)
+    return draw_plain_views(rng, draw_objects(rng, objects, families), views, size, draws)
+
+
+def draw_plain_views(
+    rng: np.random.Generator, things: Sequence[LearntObject], views: int, size: int, draws: PlainDraws | None = None
+) -> PicturePart:
+    """So many plain pictures of each of these objects."""
     pictures, rows = [], []
     for row, thing in enumerate(things):
         drawn = draw_plain(rng, thing, views, size, draws)
@@ -134,15 +133,11 @@ def draw_parts(
     yield from (path for number, path in paths.items() if number not in missing)
     if not missing:
         return
-    with _environment(_ONE_THREAD), ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+    with worker_pool(processes) as pool:
         jobs = {pool.submit(_draw_kept, paths[n], n, families, objects, views, size, plain): n for n in missing}
-        try:
-            for job in as_completed(jobs):
-                job.result()
-                yield paths[jobs[job]]
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+        for job in as_completed(jobs):
+            job.result()
+            yield paths[jobs[job]]
 
 
 def picture_set(parts: Sequence[PicturePart], recognition: Recognition | None) -> PictureSet:
@@ -166,18 +161,6 @@ def _draw_kept(path: Path, number: int, families: Families, objects: int, views:
         draw_plain_part(number, families, objects, views, size).save(path)
     else:
         draw_part(number, families, objects, views, size, looks=LOOKS)[0].save(path)
-
-
-@contextmanager
-def _environment(values: dict[str, str]) -> Iterator[None]:
-    """Variables of the processes that are started within."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def _training_picture(example: Example) -> TrainingPicture:

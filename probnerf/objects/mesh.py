@@ -146,22 +146,33 @@ def rests(mesh: trimesh.Trimesh, rng: np.random.Generator, natural: float, stret
     return placed
 
 
-def read_folder(folder: Path, y_up: Sequence[str] = (".glb", ".gltf")) -> Iterator[tuple[str, trimesh.Trimesh | str]]:
-    """Name and mesh (metres, z up) of each mesh file, or why it is left out (`why_not`)."""
-    files = sorted(f for f in Path(folder).iterdir() if f.suffix.lower() in (".glb", ".gltf", ".obj", ".ply", ".stl"))
+Y_UP = (".glb", ".gltf")
+
+
+def mesh_files(folder: Path) -> list[Path]:
+    """The folder's mesh files by name. Raises FileNotFoundError if there is none."""
+    files = sorted(f for f in Path(folder).iterdir() if f.suffix.lower() in (*Y_UP, ".obj", ".ply", ".stl"))
     if not files:
         raise FileNotFoundError(f"{folder} holds no meshes (.glb, .gltf, .obj, .ply or .stl)")
-    for file in files:
-        try:
-            mesh = trimesh.load_mesh(file)
-            mesh.merge_vertices(merge_tex=True, merge_norm=True)
-            if file.suffix.lower() in y_up:
-                mesh.apply_transform(trimesh.transformations.rotation_matrix(0.5 * np.pi, [1, 0, 0]))
-            reason = why_not(mesh)
-        except Exception as error:  # a broken file may fail anywhere in its reader, or where its mesh is used
-            yield file.stem, f"cannot be read ({str(error).splitlines()[0] if str(error) else type(error).__name__})"
-            continue
-        yield file.stem, reason or mesh
+    return files
+
+
+def read_folder(folder: Path, y_up: Sequence[str] = Y_UP) -> Iterator[tuple[str, trimesh.Trimesh | str]]:
+    """Name and mesh (metres, z up) of each mesh file, or why it is left out (`why_not`)."""
+    for file in mesh_files(folder):
+        yield file.stem, read_mesh(file, y_up)
+
+
+def read_mesh(file: Path, y_up: Sequence[str] = Y_UP) -> trimesh.Trimesh | str:
+    """A file's mesh (metres, z up), or why it is left out (`why_not`)."""
+    try:
+        mesh = trimesh.load_mesh(file)
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        if file.suffix.lower() in y_up:
+            mesh.apply_transform(trimesh.transformations.rotation_matrix(0.5 * np.pi, [1, 0, 0]))
+        return why_not(mesh) or mesh
+    except Exception as error:  # a broken file may fail anywhere in its reader, or where its mesh is used
+        return f"cannot be read ({str(error).splitlines()[0] if str(error) else type(error).__name__})"
 
 
 def why_not(mesh: trimesh.Trimesh) -> str:

@@ -76,6 +76,24 @@ PRESETS = {
             explains=0.67,  # of the household generator's validation objects
             wall_sigma=0.1,  # chosen by the scans' scores (`farside bench strangers`)
         ),
+        Preset(
+            "everyday",
+            96,
+            48,
+            6,
+            1,
+            256,
+            768,
+            32,
+            32,
+            (24, 32, 48, 64, 128),
+            radial=True,
+            fitted=True,
+            smooth=True,
+            pairs=4,
+            explains=0.67,
+            wall_sigma=0.1,
+        ),
         Preset("tiny", 4, 8, 2, 1, 16, 16, 8, 16, (4, 4, 4, 4, 4)),  # for tests
     )
 }

@@ -249,8 +249,7 @@ def initial_state(model: ProbNeRF, config: TrainConfig, recognition: Recognition
     return TrainState(model, recognition, optimiser, jnp.zeros((), jnp.int32))
 
 
-@eqx.filter_jit(donate="all-except-first")
-def train_step(
+def updated(
     static: tuple[Likelihood, TrainConfig], state: TrainState, solids: ShapeBatch | None, batch: Batch | None
 ) -> tuple[TrainState, dict[str, Array]]:
     """One update. Without `batch`, it is a step of the solid phase."""
@@ -263,6 +262,9 @@ def train_step(
     update, optimiser = optimiser_of(config).update(gradient, state.optimiser)
     model, recognition = optax.apply_updates((state.model, state.recognition), update)
     return TrainState(model, recognition, optimiser, state.step + 1), {"loss": value, **parts}
+
+
+train_step = eqx.filter_jit(updated, donate="all-except-first")
 
 
 def train(

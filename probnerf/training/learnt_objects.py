@@ -111,7 +111,7 @@ def tabletop_objects(seeds: np.ndarray) -> list[LearntObject]:
                 vertices=vertices,
                 faces=faces,
                 half_extent=float(obj.half_extent_m / obj.scale),
-                colours=_Coloured(obj),
+                colours=Coloured(obj),
                 description=_description(shapes, row, 0),
                 kind=int(shapes.kind[row]),
                 family=TABLETOP,
@@ -143,7 +143,7 @@ _colour = jax.jit(colour)
 
 
 @dataclass(frozen=True, eq=False)
-class _Coloured:
+class Coloured:
     """A tabletop object's own colours."""
 
     obj: TabletopObject

@@ -3,8 +3,8 @@
 Each camera looks approximately at the cube's centre, as does the crop that `perception` makes of a real frame.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -28,6 +28,11 @@ class ViewSet:
     def size(self) -> int:
         """Pixels per side."""
         return self.rgb.shape[2]
+
+
+def joined_views(sets: Sequence[ViewSet]) -> ViewSet:
+    """One set of the objects of several with equally many and equally large pictures."""
+    return ViewSet(**{f.name: np.concatenate([getattr(s, f.name) for s in sets]) for f in fields(ViewSet)})
 
 
 def random_camera(rng: np.random.Generator) -> tuple[np.ndarray, float]:

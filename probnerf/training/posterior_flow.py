@@ -98,8 +98,7 @@ def loss(
     return yaw + pose + shape + kind, {"yaw": yaw, "pose": pose, "shape": shape, "kind": kind}
 
 
-@eqx.filter_jit(donate="all-except-first")
-def train_step(
+def updated(
     fixed: tuple[PosteriorTrainConfig, RealNVP | None], state: PosteriorTrainState, examples: Examples
 ) -> tuple[PosteriorTrainState, dict[str, Array]]:
     """One update."""
@@ -112,6 +111,9 @@ def train_step(
     decay = jnp.minimum(config.average, (1.0 + state.step) / (10.0 + state.step))
     average = jax.tree.map(lambda a, b: decay * a + (1.0 - decay) * b, state.average, network)
     return PosteriorTrainState(network, average, optimiser, state.step + 1), {"loss": value, **parts}
+
+
+train_step = eqx.filter_jit(updated, donate="all-except-first")
 
 
 @eqx.filter_jit
