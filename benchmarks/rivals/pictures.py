@@ -1,0 +1,83 @@
+"""Draw the pictures that the rivals learn from: `python -m benchmarks.rivals.pictures --family cars --out FILE`.
+
+Objects and cameras depend on the seed alone, so each split is the same whoever draws it.
+"""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import tyro
+
+from benchmarks.harness.progress import say
+from benchmarks.paper.families import FAMILIES, SPLITS, TAN_HALF_FOV, view_set
+from benchmarks.rivals.picture_set import PictureSet
+from probnerf.training.pictures import ViewSet
+
+PART = 10  # objects, of one job
+ONE_THREAD = {  # of each process; and none of them takes an accelerator's memory
+    "JAX_PLATFORMS": "cpu",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Draw pictures of a family's objects to train rivals on."""
+
+    out: Path
+    """The file, .npz."""
+    family: Literal["cars", "bodies"] = "cars"
+    """What is drawn."""
+    split: Literal["train", "val", "test"] = "train"
+    """Of which seeds."""
+    count: int = 1500
+    """Objects, the first seeds."""
+    views: int = 24
+    """Pictures of each."""
+    size: int = 64
+    """px a side."""
+    processes: int = os.cpu_count() or 1
+    """That draw."""
+
+
+def draw(family: str, views: int, size: int, seeds: Sequence[int]) -> ViewSet:
+    """Random views of these objects of the family of this name."""
+    return view_set(FAMILIES[family], seeds, views, size)
+
+
+def draw_pictures(options: Options) -> PictureSet:
+    """All pictures, objects in the order of their seeds."""
+    seeds = SPLITS[options.split][: options.count]
+    parts = [seeds[start : start + PART] for start in range(0, len(seeds), PART)]
+    os.environ.update(ONE_THREAD)  # the processes inherit it
+    drawn = []
+    with ProcessPoolExecutor(options.processes, get_context("spawn")) as pool:
+        for views in pool.map(partial(draw, options.family, options.views, options.size), parts):
+            drawn.append(views)
+            if len(drawn) % 10 == 0 or len(drawn) == len(parts):
+                say(f"{min(len(drawn) * PART, len(seeds))} of {len(seeds)}")
+    return PictureSet(
+        rgb=np.concatenate([each.rgb for each in drawn]),
+        range=np.concatenate([each.range.astype(np.float16) for each in drawn]),
+        T_object_camera=np.concatenate([each.T_object_camera for each in drawn]),
+        tan_half_fov=np.asarray(TAN_HALF_FOV, np.float32),
+        seed=np.concatenate([each.seeds.astype(np.int64) for each in drawn]),
+    )
+
+
+def main(options: Options) -> Path:
+    """Draw and write; the path of the file."""
+    draw_pictures(options).save(options.out)
+    return options.out
+
+
+if __name__ == "__main__":
+    say(str(main(tyro.cli(Options))))
