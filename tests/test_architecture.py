@@ -76,8 +76,13 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
         "benchmarks/*",
     ),
     "equinox": ("probnerf/*", "benchmarks/*"),
-    "optax": ("probnerf/sampling/*", "probnerf/training/elbo.py", "probnerf/training/posterior_flow.py"),
-    "safetensors": ("probnerf/prior/checkpoint.py",),
+    "optax": (
+        "probnerf/sampling/*",
+        "probnerf/training/elbo.py",
+        "probnerf/training/posterior_flow.py",
+        "benchmarks/rivals/*",
+    ),
+    "safetensors": ("probnerf/prior/checkpoint.py", "benchmarks/rivals/model.py"),
     "blackjax": (),  # an independent sampler to test against
     # pictures in a second, before matplotlib is imported; PNG files, resized
     "cv2": ("calibration/*", "perception/*", "node/*/segment*.py", "probnerf/*/srn*.py", "benchmarks/*/intrinsics.py"),
