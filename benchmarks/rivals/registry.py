@@ -8,6 +8,10 @@ from typing import Any
 from benchmarks.rivals.functa import Functa, FunctaConfig
 from benchmarks.rivals.functa_recipe import functa_recipe
 from benchmarks.rivals.model import load_rival
+from benchmarks.rivals.nerf_vae import NeRFVAE, NeRFVAEConfig, nerf_vae_recipe
+from benchmarks.rivals.pi_gan import PiGAN, PiGANConfig
+from benchmarks.rivals.pi_gan_recipe import pi_gan_recipe
+from benchmarks.rivals.pixel_nerf import PixelNeRF, PixelNeRFConfig, pixel_nerf_recipe
 from benchmarks.rivals.recipe import Recipe
 
 
@@ -25,12 +29,32 @@ class Entry:
     """Sizes for tests."""
 
 
+SMALL = {"samples": 12, "objects": 4, "rays": 64}
 RIVALS: dict[str, Entry] = {
     "functa": Entry(
         FunctaConfig,
         Functa,
         functa_recipe,
         tiny={"width": 32, "layers": 3, "latent": 16, "samples": 12, "objects": 4, "rays": 64, "map_steps": 20},
+    ),
+    "nerf_vae": Entry(
+        NeRFVAEConfig,
+        NeRFVAE,
+        nerf_vae_recipe,
+        tiny=SMALL | {"latent": 16, "channels": (8, 16), "summary": 32, "width": 32, "blocks": 2},
+    ),
+    "pi_gan": Entry(
+        PiGANConfig,
+        PiGAN,
+        pi_gan_recipe,
+        tiny={"latent": 8, "mapping": 32, "width": 16, "layers": 2, "samples": 6, "sizes": (8, 16), "batches": (4, 4)}
+        | {"channels": (16, 16, 32)},
+    ),
+    "pixel_nerf": Entry(
+        PixelNeRFConfig,
+        PixelNeRF,
+        pixel_nerf_recipe,
+        tiny=SMALL | {"channels": (8, 16, 16), "features": 16, "width": 32, "blocks": 2},
     ),
 }
 
