@@ -27,7 +27,7 @@ class PixelNeRFConfig:
     """Outside is nothing."""
     tan_half_fov: float
     """Of all cameras."""
-    channels: tuple[int, ...] = (32, 64, 128, 160, 192)
+    channels: tuple[int, ...] = (32, 64, 96, 128, 160)
     """Of the U-net on its way down, from the whole picture on."""
     features: int = 96
     """Of a pixel."""
