@@ -61,7 +61,7 @@ class Diffusion(eqx.Module):
             sd = jnp.sqrt((1.0 - before[t]) / (1.0 - kept[t]) * (1.0 - alpha))
             return x + sd * jax.random.normal(key, x.shape), None
 
-        start = jax.random.normal(k0, (count, self.enter.in_features))
+        start = jax.random.normal(k0, (count, self.enter.weight.shape[1]))
         return jax.lax.scan(one, start, (jnp.arange(STEPS)[::-1], jax.random.split(k1, STEPS)))[0]
 
 

@@ -19,6 +19,8 @@ from benchmarks.rivals.model import picture_rays, rendered
 from benchmarks.rivals.volume import Box, integrate
 from probnerf.prior.networks import RealNVP
 
+FIRST_STEP = 20.0  # of the inner loop, before it is learnt: about what lowers the loss most in a new field
+
 
 @dataclass(frozen=True)
 class FunctaConfig:
@@ -37,7 +39,9 @@ class FunctaConfig:
     density_scale: float = 30.0
     """Per cube unit."""
     samples: int = 48
-    """On a ray."""
+    """On a ray of a picture."""
+    training_samples: int = 32
+    """On a ray while the field learns."""
     objects: int = 12
     """A step."""
     rays: int = 192
@@ -106,7 +110,7 @@ class Functa(eqx.Module):
         self.siren = Siren(config, k0)
         shape = (config.latent, config.layers, config.width)
         self.modulation = jax.random.normal(k1, shape) / (config.frequency * config.latent**0.5)
-        self.log_step = jnp.zeros(config.latent)
+        self.log_step = jnp.full(config.latent, jnp.log(FIRST_STEP))
         self.mean, self.deviation = jnp.zeros(config.latent), jnp.ones(config.latent)
         self.flow = RealNVP(config.latent, config.flow_hidden, k2, config.flow_pairs)
         self.diffusion = Diffusion(config.latent, config.diffusion_width, config.diffusion_blocks, k3)
@@ -122,10 +126,11 @@ class Functa(eqx.Module):
         latent: Float[Array, "k"],
         origin: Float[Array, "n 3"],
         direction: Float[Array, "n 3"],
-        key: PRNGKeyArray | None = None,
+        key: PRNGKeyArray,
+        samples: int,
     ) -> Float[Array, "n 3"]:
-        """Of rays, on white."""
-        box, samples = self.config.box, self.config.samples
+        """Of rays, on white, with as many random samples."""
+        box = self.config.box
         return integrate(lambda points, _: self.field(latent, points), box, origin, direction, samples, key)[0]
 
     def log_prior(self, latent: Float[Array, "k"]) -> Float[Array, ""]:
@@ -147,7 +152,7 @@ class Functa(eqx.Module):
         def loss(normal, key):
             k0, k1 = jax.random.split(key)
             rays = jax.random.randint(k0, (config.map_rays,), 0, size * size)
-            rgb = self.colours(self.mean + self.deviation * normal, origin[rays], direction[rays], k1)
+            rgb = self.colours(self.mean + self.deviation * normal, origin[rays], direction[rays], k1, config.samples)
             misfit = 0.5 * size * size * jnp.mean(jnp.sum((rgb - truth[rays]) ** 2, axis=-1)) / config.noise**2
             return misfit - self.log_prior(normal)
 

@@ -12,7 +12,7 @@ from benchmarks.rivals.functa import Functa, FunctaConfig
 from benchmarks.rivals.recipe import Metrics, Phase, Recipe, descend, optimiser, rate
 from benchmarks.rivals.volume import Pictures, draw_rays
 
-FIELD_RATE, PRIOR_RATE = 5e-4, 5e-4
+FIELD_RATE, PRIOR_RATE = 1e-3, 5e-4
 FIELD_SHARE = 0.75  # of the time
 FUNCTA_RAYS = 512  # an inner step when the functaset is made
 PASSES = 2  # latents of each object, from different rays: they tell the priors how exact latents are
@@ -71,7 +71,8 @@ def misfit(
     k0, k1, k2 = jax.random.split(key, 3)
     views = jax.random.randint(k0, (len(objects), rays), 0, pictures.rgb.shape[1])
     drawn = draw_rays(pictures, objects, views, k1)
-    rgb = jax.vmap(model.colours)(latent, drawn.origin, drawn.direction, jax.random.split(k2, len(objects)))
+    colours = partial(model.colours, samples=model.config.training_samples)
+    rgb = jax.vmap(colours)(latent, drawn.origin, drawn.direction, jax.random.split(k2, len(objects)))
     return jnp.sum(jnp.mean(drawn.weight * jnp.mean((rgb - drawn.rgb) ** 2, axis=-1), axis=-1))
 
 

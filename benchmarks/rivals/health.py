@@ -29,7 +29,8 @@ def psnr(rgb: Float[np.ndarray, "*n"], truth: UInt8[np.ndarray, "*n"]) -> float:
 def examine(model: Any, learnt: PictureSet, new: PictureSet) -> tuple[dict[str, float], UInt8[np.ndarray, "h w 3"]]:
     """Mean psnr, dB, of the given view and of others, for objects that were learnt and for new ones; and a picture.
 
-    A row of it is an object: the given view and two others, each beside the model's. Then follow two rows of samples of each prior.
+    A row of it is an object: the given view and two others, each beside the model's. Then come
+    two rows of samples of each prior.
     """
     figures, rows = {}, []
     size, key = learnt.rgb.shape[2], jax.random.key(0)

@@ -35,7 +35,8 @@ RIVALS: dict[str, Entry] = {
         FunctaConfig,
         Functa,
         functa_recipe,
-        tiny={"width": 32, "layers": 3, "latent": 16, "samples": 12, "objects": 4, "rays": 64, "map_steps": 20},
+        tiny={"width": 32, "layers": 3, "latent": 16, "samples": 12, "training_samples": 12, "objects": 4, "rays": 64}
+        | {"flow_hidden": 16, "diffusion_width": 16, "diffusion_blocks": 1, "map_steps": 20, "map_rays": 64},
     ),
     "nerf_vae": Entry(
         NeRFVAEConfig,
