@@ -19,7 +19,7 @@ from benchmarks.rivals.model import picture_rays, rendered
 from benchmarks.rivals.volume import Box, integrate
 from probnerf.prior.networks import RealNVP
 
-FIRST_STEP = 20.0  # of the inner loop, before it is learnt: about what lowers the loss most in a new field
+FIRST_STEP = 5.0  # of the inner loop, before it is learnt: about what lowers the loss most in a new field
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class FunctaConfig:
     diffusion_width: int = 384
     diffusion_blocks: int = 3
     map_steps: int = 1000
-    map_rays: int = 1024
+    map_rays: int = 512
     """A step."""
     map_rate: float = 0.03
     """First step size of Adam, in deviations of a latent."""

@@ -1,5 +1,6 @@
 """How Functa is trained: the field by meta-learning, then the functaset, then both priors of its latents."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,6 +20,7 @@ PASSES = 2  # latents of each object, from different rays: they tell the priors 
 KEPT_BACK = 0.05  # of the functaset, for choosing the priors' best weights
 BATCH = 256  # latents
 JITTER = 0.05  # of latents that priors learn from, in deviations: there are few
+QUICK_STEPS = 300  # of the MAP search, when the model is examined
 PRIORS = ("flow", "diffusion")
 
 
@@ -134,7 +136,8 @@ def prior_step(
     k0, k1, k2 = jax.random.split(key, 3)
     rows = jax.random.randint(k0, (BATCH,), 0, len(state.learnt))
     latents = state.learnt[rows] + JITTER * jax.random.normal(k1, (BATCH, state.learnt.shape[1]))
-    metrics, found, kept, best = {}, {}, {}, {}
+    metrics: Metrics = {}
+    found, kept, best = {}, {}, {}
     for name in PRIORS:
         before = getattr(state.model, name)
         loss, gradient = jax.value_and_grad(partial(prior_loss, name))(before, latents, k2)
@@ -156,6 +159,13 @@ def best_model(state: FieldState | PriorState) -> Functa:
     return eqx.tree_at(lambda m: (m.flow, m.diffusion), state.model, priors)
 
 
+def quick(model: Functa) -> Functa:
+    """The model with a shorter search for the MAP latent."""
+    config = replace(model.config, map_steps=min(model.config.map_steps, QUICK_STEPS))
+    structure = jax.tree.structure(jax.eval_shape(lambda key: Functa(config, key), jax.random.key(0)))
+    return jax.tree.unflatten(structure, jax.tree.leaves(model))
+
+
 def functa_recipe(config: FunctaConfig) -> Recipe:
     """The field, then the priors."""
 
@@ -164,4 +174,5 @@ def functa_recipe(config: FunctaConfig) -> Recipe:
         return FieldState(model, optimiser().init(model))
 
     field = Phase("field", field_step, FIELD_SHARE)
-    return Recipe(start, (field, Phase("priors", prior_step, 1.0 - FIELD_SHARE, make_functaset)), best_model)
+    priors = Phase("priors", prior_step, 1.0 - FIELD_SHARE, make_functaset)
+    return Recipe(start, (field, priors), best_model, quick)

@@ -35,15 +35,14 @@ def examine(model: Any, learnt: PictureSet, new: PictureSet) -> tuple[dict[str, 
     figures, rows = {}, []
     size, key = learnt.rgb.shape[2], jax.random.key(0)
     if isinstance(model, Conditioned):
-        answer = jax.jit(lambda picture, T: _first(model.condition(picture, T, key, 1)))
         for name, objects in (("learnt", learnt), ("new", new)):
-            given, others = [], []
-            for rgb, T in zip(objects.rgb[:EXAMINED], objects.T_object_camera[:EXAMINED], strict=True):
-                state = answer(jnp.asarray(rgb[GIVEN]), jnp.asarray(T[GIVEN]))
-                views = [GIVEN, *SHOWN]
-                shown = _shown(model, state, T[views], size)
+            given, others, views = [], [], [GIVEN, *SHOWN]
+            pictures, poses = objects.rgb[:EXAMINED], objects.T_object_camera[:EXAMINED]
+            states = _answers(model, jnp.asarray(pictures[:, GIVEN]), jnp.asarray(poses[:, GIVEN]), key)
+            for i, (rgb, T) in enumerate(zip(pictures, poses, strict=True)):
+                shown = _shown(model, _nth(states, i), T[views], size)
                 given.append(psnr(shown[0], rgb[GIVEN]))
-                others += [psnr(shown[i], rgb[view]) for i, view in enumerate(views) if i > 0]
+                others += [psnr(shown[v], rgb[view]) for v, view in enumerate(views) if v > 0]
                 pairs = zip(rgb[views], np.round(255.0 * shown).astype(np.uint8), strict=True)
                 rows.append(np.concatenate([half for pair in pairs for half in pair], axis=1))
             figures[f"psnr_given_{name}"] = round(float(np.mean(given)), 2)
@@ -84,5 +83,6 @@ def _nth(states: Any, n: int) -> Any:
     return jax.tree.map(lambda array: array[n], states)
 
 
-def _first(states: Any) -> Any:
-    return _nth(states, 0)
+@jax.jit
+def _answers(model, pictures, poses, key):
+    return jax.vmap(lambda picture, T: _nth(model.condition(picture, T, key, 1), 0))(pictures, poses)

@@ -196,7 +196,7 @@ def main(options: Options) -> Path:
             state = reached
     model = recipe.model(state)
     run.save(model, finished=True)
-    figures, picture = examine(model, learnt, new)
+    figures, picture = examine(recipe.quick(model), learnt, new)
     write_png(options.out / f"{options.model}.png", picture)
     run.write(figures)
     run.save(model, finished=True, **figures)
