@@ -79,4 +79,5 @@ class Discriminator(eqx.Module):
         x = jnp.concatenate([x.reshape(len(x), -1), jnp.full((len(x), 1), spread)], axis=-1)
         h = jax.nn.leaky_relu(self.summary(x), 0.2)
         camera = self.camera[1](jax.nn.leaky_relu(self.camera[0](T_object_camera[:, :3, :3].reshape(-1, 9)), 0.2))
-        return (self.verdict(h)[:, 0] + jnp.sum(h * camera, axis=-1) / jnp.sqrt(h.shape[-1])).astype(jnp.float32)
+        match = jnp.sum((h * camera).astype(jnp.float32), axis=-1) / jnp.sqrt(h.shape[-1])
+        return self.verdict(h)[:, 0].astype(jnp.float32) + match
