@@ -2,7 +2,8 @@
 
 A point estimate without a prior. Smaller than the published one: a U-net on 64x64 pictures takes the place of a
 ResNet-34 that has seen ImageNet, and one pass of samples the place of two. As there, points and directions are in the
-camera's frame of the given picture, and the loss is the squared error of random rays of other views.
+camera's frame of the given picture, and the loss is the squared error of random rays of other views. Points are also
+given in the object's frame: all methods are told the camera's pose in it, and it speeds learning.
 """
 
 from dataclasses import dataclass
@@ -95,7 +96,7 @@ class PixelNeRF(eqx.Module):
         k0, k1, k2, *keys = jax.random.split(key, 3 + config.blocks)
         self.config = config
         self.encoder = UNet(config.channels, config.features, k0)
-        self.enter = Dense(3 * (1 + 2 * config.octaves) + 3, config.width, k1)
+        self.enter = Dense(6 * (1 + 2 * config.octaves) + 3, config.width, k1)
         self.blocks = tuple(ConditionedBlock(config.width, config.features, k) for k in keys)
         self.leave = Dense(config.width, 4, k2, gain=0.1)
 
@@ -109,7 +110,8 @@ class PixelNeRF(eqx.Module):
         tan = jnp.asarray(self.config.tan_half_fov)
         place, camera = projected(seen.T_object_camera, tan, points, len(seen.features))
         view = directions @ seen.T_object_camera[:3, :3]
-        h = self.enter(jnp.concatenate([encoded(camera, self.config.octaves), view], axis=-1))
+        places = encoded(jnp.stack([camera, points], axis=1), self.config.octaves).reshape(len(points), -1)
+        h = self.enter(jnp.concatenate([places, view], axis=-1))
         condition = bilinear(seen.features, place)
         for block in self.blocks:
             h = block(h, condition)
