@@ -111,18 +111,24 @@ def frames_and_box(
 ) -> tuple[Int[np.ndarray, "n v 4"], Box]:
     """Each object's frame in its pictures (`Pictures.frame`), and a box about all surfaces seen. 0 is a miss."""
     size = distance.shape[2]
-    seen = distance > 0
-    rows, columns = seen.any(axis=3), seen.any(axis=2)
-    first = [s.argmax(axis=-1) for s in (rows, columns)]
-    last = [size - s[..., ::-1].argmax(axis=-1) for s in (rows, columns)]
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for T, ranges in zip(T_object_camera, distance, strict=True):
-        view, row, column = np.nonzero(ranges)
-        image = (2.0 * (np.stack([column, row], axis=-1) + 0.5) / size - 1.0) * tan_half_fov
-        ray = np.concatenate([image, np.ones_like(image[:, :1])], axis=-1)
-        ray *= (ranges[view, row, column].astype(np.float32) / np.linalg.norm(ray, axis=-1))[:, None]
-        points = T[view, :3, 3] + np.einsum("nij,nj->ni", T[view, :3, :3], ray)
-        low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
-    x0, y0, z0 = (low - MARGIN).round(4).tolist()
-    x1, y1, z1 = (high + MARGIN).round(4).tolist()
+    seen = np.asarray(distance > 0)
+    rows, columns = np.any(seen, axis=3), np.any(seen, axis=2)
+    first = [np.argmax(s, axis=-1) for s in (rows, columns)]
+    last = [size - np.argmax(s[..., ::-1], axis=-1) for s in (rows, columns)]
+    row, column = np.meshgrid(np.arange(size), np.arange(size), indexing="ij")
+    centre = jnp.asarray(np.stack([column, row], axis=-1) + 0.5)
+
+    def corners(given):
+        ranges, T = given
+        ray = directions(
+            T[:, None, None], jnp.asarray(tan_half_fov), jnp.broadcast_to(centre, (*ranges.shape, 2)), size
+        )
+        points = T[:, None, None, :3, 3] + ranges[..., None].astype(jnp.float32) * ray
+        hit = (ranges > 0)[..., None]
+        spans = jnp.where(hit, points, jnp.inf), jnp.where(hit, points, -jnp.inf)
+        return jnp.min(spans[0], axis=(0, 1, 2)), jnp.max(spans[1], axis=(0, 1, 2))
+
+    low, high = jax.jit(lambda *given: jax.lax.map(corners, given))(distance, T_object_camera)
+    x0, y0, z0 = (np.min(low, axis=0).astype(float) - MARGIN).round(4).tolist()
+    x1, y1, z1 = (np.max(high, axis=0).astype(float) + MARGIN).round(4).tolist()
     return np.stack([*first, *last], axis=-1).astype(np.int32), (x0, y0, z0, x1, y1, z1)
