@@ -129,6 +129,6 @@ def frames_and_box(
         return jnp.min(spans[0], axis=(0, 1, 2)), jnp.max(spans[1], axis=(0, 1, 2))
 
     low, high = jax.jit(lambda *given: jax.lax.map(corners, given))(distance, T_object_camera)
-    x0, y0, z0 = (np.min(low, axis=0).astype(float) - MARGIN).round(4).tolist()
-    x1, y1, z1 = (np.max(high, axis=0).astype(float) + MARGIN).round(4).tolist()
+    x0, y0, z0 = (np.min(np.asarray(low, float), axis=0) - MARGIN).round(4).tolist()
+    x1, y1, z1 = (np.max(np.asarray(high, float), axis=0) + MARGIN).round(4).tolist()
     return np.stack([*first, *last], axis=-1).astype(np.int32), (x0, y0, z0, x1, y1, z1)
