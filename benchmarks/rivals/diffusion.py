@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 STEPS = 250  # T
 TIME_FEATURES = 32
+LARGEST = 4.0  # coordinate of x_0, in standard deviations
 
 
 class Diffusion(eqx.Module):
@@ -49,7 +50,7 @@ class Diffusion(eqx.Module):
         return jnp.mean((found - noise) ** 2)
 
     def sample(self, key: PRNGKeyArray, count: int) -> Float[Array, "n k"]:
-        """Ancestral sampling (Ho et al., algorithm 2)."""
+        """Ancestral sampling (Ho et al., eqs. 6 and 7), of vectors of standardised coordinates."""
         kept = kept_shares()
         before = jnp.concatenate([jnp.ones(1), kept[:-1]])
         k0, k1 = jax.random.split(key)
@@ -57,9 +58,13 @@ class Diffusion(eqx.Module):
         def one(x, given):
             t, key = given
             alpha = kept[t] / before[t]
-            x = (x - (1.0 - alpha) / jnp.sqrt(1.0 - kept[t]) * jax.vmap(self.noise, (0, None))(x, t)) / jnp.sqrt(alpha)
+            noise = jax.vmap(self.noise, (0, None))(x, t)
+            # where almost nothing of x_0 is left, its estimate could be anything
+            start = jnp.clip((x - jnp.sqrt(1.0 - kept[t]) * noise) / jnp.sqrt(kept[t]), -LARGEST, LARGEST)
+            shares = jnp.sqrt(before[t]) * (1.0 - alpha), jnp.sqrt(alpha) * (1.0 - before[t])
+            mean = (shares[0] * start + shares[1] * x) / (1.0 - kept[t])
             sd = jnp.sqrt((1.0 - before[t]) / (1.0 - kept[t]) * (1.0 - alpha))
-            return x + sd * jax.random.normal(key, x.shape), None
+            return mean + sd * jax.random.normal(key, x.shape), None
 
         start = jax.random.normal(k0, (count, self.enter.weight.shape[1]))
         return jax.lax.scan(one, start, (jnp.arange(STEPS)[::-1], jax.random.split(k1, STEPS)))[0]
