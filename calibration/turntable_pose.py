@@ -50,7 +50,7 @@ def locate_plate(board: Board, camera: Camera, rgb: UInt8[np.ndarray, "h w 3"]) 
     spread = np.linalg.svd(points[:, :2] - points[:, :2].mean(axis=0), compute_uv=False)[1] / np.sqrt(count)
     if spread < _LEAST_SPREAD * board.square:
         raise PlateNotFoundError(f"the {count} corners found lie almost in a line; show more of the board")
-    fitted = _fit_pose(points, pixels, camera)
+    fitted = fit_pose(points, pixels, camera)
     if fitted is None:
         raise PlateNotFoundError(f"no pose fits the {count} corners found; check the camera's calibration")
     T_camera_board, rms = fitted
@@ -60,7 +60,7 @@ def locate_plate(board: Board, camera: Camera, rgb: UInt8[np.ndarray, "h w 3"]) 
     return PlatePose(T_plate_camera, count, rms)
 
 
-def _fit_pose(
+def fit_pose(
     points: Float[np.ndarray, "n 3"], pixels: Float[np.ndarray, "n 2"], camera: Camera
 ) -> tuple[Float[np.ndarray, "4 4"], float] | None:
     """T_camera_board of a flat board by least squares in pixels, through the camera's own lens, and its rms (px)."""

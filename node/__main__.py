@@ -18,8 +18,8 @@ import tyro
 from rich.console import Console
 
 from node.commands.batch_options import BatchConfig
+from node.commands.calibration_options import Calibrate, HandEyeOptions
 from node.commands.options import (
-    Calibrate,
     Capture,
     LiveConfig,
     Query,
@@ -48,6 +48,7 @@ SUMMARIES = {
     "query": str(Query.__doc__),
     "view": str(View.__doc__),
     "calibrate": str(Calibrate.__doc__).split("\n")[0],
+    "hand-eye": str(HandEyeOptions.__doc__).split("\n")[0],
     "capture": str(Capture.__doc__),
     "train": str(Training.__doc__),
     "train-network": str(NetworkTraining.__doc__),
@@ -171,6 +172,14 @@ def _calibrate(args: Sequence[str]) -> int:
     return 0
 
 
+def _hand_eye(args: Sequence[str]) -> int:
+    options = tyro.cli(HandEyeOptions, args=args, prog="farside hand-eye")
+    from node.commands.hand_eye import locate_camera
+
+    locate_camera(options, Console(), Console(stderr=True))
+    return 0
+
+
 def _capture(args: Sequence[str]) -> int:
     options = tyro.cli(Capture, args=args, prog="farside capture")
     from node.commands.capture import capture
@@ -214,6 +223,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "query": _query,
     "view": _view,
     "calibrate": _calibrate,
+    "hand-eye": _hand_eye,
     "capture": _capture,
     "train": _train,
     "train-network": _train_network,

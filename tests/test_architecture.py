@@ -36,7 +36,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     "calibration": (
         ("boards", "camera", "deviations", "turntable"),
         ("camchain", "fit", "print_board", "turntable_pose"),
-        ("calibrate", "camera_file", "coverage", "projection"),
+        ("calibrate", "camera_file", "coverage", "hand_eye", "pose_files", "projection"),
     ),
     "probnerf": (
         ("environment", "geometry", "pixel_status", "settings", "types"),
@@ -87,6 +87,8 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     # pictures in a second, before matplotlib is imported; PNG files, resized
     "cv2": ("calibration/*", "perception/*", "node/*/segment*.py", "probnerf/*/srn*.py", "benchmarks/*/intrinsics.py"),
     "scipy": (
+        "calibration/hand_eye.py",
+        "calibration/pose_files.py",
         "node/figures/object_figure.py",  # morphology
         "node/figures/voxel_renderer.py",
         "node/ros/messages.py",
@@ -106,7 +108,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "dask": ("node/commands/batch_dask.py",),  # the extra `cluster`, imported when it is asked for
     "distributed": ("node/commands/batch_dask.py", "benchmarks/studies/batch.py"),
     "mcap": ("perception/sources/log_messages.py", "perception/sources/recorder.py"),
-    "yaml": ("calibration/camera_file.py",),  # camera files, which ROS writes as YAML 1.1
+    "yaml": ("calibration/camera_file.py", "calibration/pose_files.py"),  # which ROS and its tools write as YAML 1.1
     # launch files: YAML 1.2 (1e-3 is a number), no key twice; then into dataclasses
     "ruamel": ("node/commands/config_file.py",),
     "pydantic": ("node/commands/config_file.py",),

@@ -17,7 +17,7 @@ from calibration.coverage import Coverage, coverage, next_views
 from calibration.fit import BoardView
 from calibration.print_board import Paper, write_target
 from calibration.projection import Projection, projection
-from node.commands.options import Calibrate
+from node.commands.calibration_options import Calibrate
 from node.figures.calibration_figure import draw_calibration
 from perception.sources.open_source import open_source
 from perception.sources.pictures import Picture, open_pictures

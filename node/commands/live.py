@@ -14,6 +14,7 @@ from contextlib import ExitStack
 from rich.console import Console
 
 from calibration.camera_file import read_camera
+from calibration.pose_files import read_mounting
 from node.commands.options import LiveConfig
 from node.ros.bus import Bus
 from node.ros.clock import Clock
@@ -55,6 +56,7 @@ def live(config: LiveConfig, out: Console, err: Console) -> None:
     file that cannot be written; at the end also if the recording broke off. A fault of one frame is reported once and
     counted.
     """
+    mounting = None if config.hand_eye is None else read_mounting(config.hand_eye)
     tracker = Tracker(load_prior(config.prior), config.controller, config.track, config.seed)
     with ExitStack() as stack:
         bus = stack.enter_context(Bus(config.bus, lambda text: err.print(text, highlight=False, soft_wrap=True)))
@@ -82,7 +84,10 @@ def live(config: LiveConfig, out: Console, err: Console) -> None:
             warm_up(tracker)  # before the first frame: its stalls would hold up the reader
         stack.enter_context(reader)
         keeper.thread.start()
-        answers = Answers(announcer.node, config.planner, FrameTree(bus), clock)
+        frames = FrameTree(bus)
+        if mounting is not None:
+            frames.mount(bus, mounting)
+        answers = Answers(announcer.node, config.planner, frames, clock)
         node = LiveNode(config, tracker, announcer, answers, reader, keeper, recorder, err)
         answers.serve(bus)
         serve_parameters(bus, flat(config) | {"use_sim_time": config.bus.use_sim_time})

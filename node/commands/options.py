@@ -155,6 +155,9 @@ class LiveConfig:
     """Colour image of a recording that has several."""
     depth_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: by type and name)")] = None
     """Depth image of a recording; needed where its name does not say depth, or its frame_id is not colour's."""
+    hand_eye: Annotated[Path | None, arg(metavar="FILE.yaml", help_behavior_hint="(default: the robot's /tf)")] = None
+    """Where the camera is on the robot, as `farside hand-eye` writes it: published on /tf_static, so that questions may
+    be asked in the robot's frames."""
     record: Annotated[Path | None, arg(metavar="FILE.mcap", help_behavior_hint="(default: no recording)")] = None
     """Record every frame, the hypotheses and their schedule to a new file; `farside replay --schedule` repeats it."""
     page: Annotated[int | None, arg(metavar="PORT", help_behavior_hint="(default: no page)")] = None
@@ -254,54 +257,6 @@ class View:
     """Port of the page on this machine (127.0.0.1); 0 takes a free one."""
     token: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Put a random token into the page's address: nobody else on this machine can open it."""
-
-
-@dataclass(frozen=True)
-class Calibrate:
-    """Measure a camera's intrinsics from pictures of a printed board; write a camera file that ROS reads, too.
-
-    1. farside calibrate --print-target board.pdf, and print it at 100%.
-    2. Take 15 or more pictures: the board tilted by 30 to 45 degrees to each side, near and far, in every corner.
-    3. farside calibrate PICTURES --out camera.yaml
-
-    Or move the board before a live camera: farside calibrate webcam:0, and Ctrl-C when no advice is left.
-    """
-
-    source: Annotated[
-        Positional[str | None], arg(metavar="[SOURCE]", help_behavior_hint="(this, --from or --print-target)")
-    ] = None
-    """Images (folder, or ROS's calibrationdata.tar.gz), recording (needs no camera_info), video, or oak, webcam:N."""
-    board: Annotated[
-        str | None, arg(metavar="BOARD", help_behavior_hint="(default: charuco:7x5:0.035:0.026:DICT_5X5_100)")
-    ] = None
-    """chessboard:8x6:0.025 (inner corners, square in m), charuco with squares, square, marker and dictionary,
-    circles:7x5:0.03, asymmetric_circles:4x11:0.02, or aprilgrid:6x6:0.03:0.3 (tags, tag in m, gap in tags)."""
-    out: Annotated[Path, arg(metavar="FILE.yaml")] = Path("camera.yaml")
-    """The camera file, as ROS reads it, with standard deviations; a picture (.png) of the views goes beside it."""
-    model: Annotated[
-        Literal["plumb_bob", "rational_polynomial", "equidistant"],
-        arg(metavar="{plumb_bob,rational_polynomial,equidistant}"),
-    ] = "plumb_bob"
-    """Lens: plumb_bob (5 coefficients; most cameras), rational_polynomial (8; wide), equidistant (4; fisheye)."""
-    name: Annotated[str, arg(metavar="NAME")] = "camera"
-    """camera_name in the file."""
-    every: Annotated[int, arg(metavar="N")] = 1
-    """Look at every Nth picture only."""
-    from_: Annotated[
-        Path | None, arg(name="from", metavar="SOURCE", help_behavior_hint="(measures nothing; needs no board)")
-    ] = None
-    """Write the camera that a recording (camera_info), a frame folder (meta.json), a camera file or the calibration of
-    an OAK camera (.json, of the image as the lens makes it) states to --out."""
-    socket: Annotated[str, arg(metavar="SOCKET")] = "CAM_A"
-    """With --from FILE.json: which camera of the device."""
-    size: Annotated[tuple[int, int], arg(metavar="W H")] = (640, 480)
-    """With --from FILE.json: the size of its images, px."""
-    print_target: Annotated[
-        Path | None, arg(metavar="FILE.pdf|FILE.png", help_behavior_hint="(in true millimetres)")
-    ] = None
-    """Write a page with the board, to print."""
-    paper: Literal["A4", "A3", "letter"] = "A4"
-    """Paper of --print-target."""
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from calibration.pose_files import Mounting
 from node.ros.bus import Bus
-from node.ros.messages import matrix
+from node.ros.messages import make, matrix
+from node.ros.scene_messages import transform_message
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 KEPT_NS = 10_000_000_000  # of each moving frame; as tf2
@@ -100,6 +102,14 @@ class FrameTree:
                     edge.add(it.header.stamp.sec * 1_000_000_000 + it.header.stamp.nanosec, T)
         if trouble:
             raise ValueError(trouble)
+
+    def mount(self, bus: Bus, camera: Mounting) -> None:
+        """Keep where a camera is on the robot, and publish it on /tf_static for all."""
+        message = make(
+            TRANSFORMS, transforms=[transform_message(camera.T_parent_camera, 0, camera.parent, camera.camera)]
+        )
+        self.take(message, static=True)
+        bus.publisher("/tf_static", TRANSFORMS, latched=True).publish(message)
 
     def pin(self, stamp: int) -> None:
         """Keep all places at this time (ns), of the picture that questions are about, until the next is pinned."""

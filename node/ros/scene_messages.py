@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from calibration.camera import Camera
 from node.figures.summary import unexplained
@@ -210,20 +210,20 @@ def counts_status(counts: Mapping[str, Mapping[str, int]]) -> DiagnosticStatus:
 
 def transforms_message(scene: Sequence[Hypotheses], node: str) -> Any:
     """A tf2_msgs/TFMessage: each object's frame in the camera's."""
-    transforms = []
-    for h in scene:
-        place = pose(h.object_frame.T_camera_object)
-        p = place.position
-        transforms.append(
-            make(
-                "geometry_msgs/msg/TransformStamped",
-                header=header(h.stamp_ns, h.frame_id),
-                child_frame_id=object_frame_id(node, h.object_id),
-                transform=make(
-                    "geometry_msgs/msg/Transform",
-                    translation=make("geometry_msgs/msg/Vector3", x=p.x, y=p.y, z=p.z),
-                    rotation=place.orientation,
-                ),
-            )
-        )
-    return make("tf2_msgs/msg/TFMessage", transforms=transforms)
+    places = (
+        (h.object_frame.T_camera_object, h.stamp_ns, h.frame_id, object_frame_id(node, h.object_id)) for h in scene
+    )
+    return make("tf2_msgs/msg/TFMessage", transforms=[transform_message(*place) for place in places])
+
+
+def transform_message(T: Float[np.ndarray, "4 4"], stamp_ns: int, frame: str, child: str) -> Any:
+    """A geometry_msgs/TransformStamped: p_frame = T @ p_child, metres."""
+    place = pose(T)
+    p = place.position
+    moved = make("geometry_msgs/msg/Vector3", x=p.x, y=p.y, z=p.z)
+    return make(
+        "geometry_msgs/msg/TransformStamped",
+        header=header(stamp_ns, frame),
+        child_frame_id=child,
+        transform=make("geometry_msgs/msg/Transform", translation=moved, rotation=place.orientation),
+    )

@@ -18,7 +18,7 @@ from calibration.coverage import coverage
 from calibration.projection import projection
 from node.__main__ import main
 from node.commands.calibrate import find_views
-from node.commands.options import Calibrate
+from node.commands.calibration_options import Calibrate
 from node.figures.calibration_figure import draw_calibration
 from perception.sources.frame import Frame
 from perception.sources.oak import camera_of_device_json
