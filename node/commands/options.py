@@ -15,7 +15,7 @@ from calibration.turntable import TurntableConfig
 from node.ros.settings import BusConfig, PlannerConfig, TopicConfig
 from perception.inference.settings import ControllerConfig, TrackConfig
 from perception.observation.settings import SegmentConfig
-from perception.sources.settings import SHIPPED_LOG, RecordConfig
+from perception.sources.settings import SHIPPED_LOG, OakConfig, RecordConfig
 from perception.sources.topic_names import TopicNames
 from probnerf.settings import Method
 
@@ -176,6 +176,7 @@ class LiveConfig:
     prior: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the shipped one)")] = None
     """Weights of another prior."""
     bus: BusConfig = field(default_factory=lambda: BusConfig(listen=(ENDPOINT,)))
+    oak: OakConfig = field(default_factory=OakConfig)
     topic: TopicConfig = field(default_factory=TopicConfig)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     recording: RecordConfig = field(default_factory=RecordConfig)

@@ -20,6 +20,7 @@ import numpy as np
 from calibration.camera import Camera
 from foundation.one_line import one_line
 from perception.sources.frame import Frame, known_counts
+from perception.sources.settings import OakConfig
 from perception.sources.time_limit import within
 
 os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")  # it would end the process where Python raises OSError
@@ -33,25 +34,6 @@ _QUEUE = 30  # pairs that wait here before the oldest is dropped
 _POLL = timedelta(milliseconds=100)
 _OPENING_S, _CLOSING_S = 30.0, 3.0  # timeouts for a device that hangs
 _METRES = np.float32(1e-3)  # depth counts are millimetres
-
-
-@dataclass(frozen=True)
-class OakConfig:
-    """How an OAK camera is used."""
-
-    width: int = 640  # px, of colour and depth
-    height: int = 480  # px
-    fps: float = 30.0
-    tolerance_ms: float = 10.0  # between colour and depth of one frame
-    undistort: bool = True  # by the device, which aligns depth to the undistorted image: else they differ at the edges
-    silence_s: float = 5.0  # without a frame: the camera counts as lost
-    retry_s: float = 0.5  # after a loss, doubled up to `longest_retry_s`
-    longest_retry_s: float = 8.0
-
-    def __post_init__(self) -> None:
-        for name in ("width", "height", "fps", "tolerance_ms", "silence_s", "retry_s", "longest_retry_s"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"oak: {name} is {getattr(self, name)}; give more than 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,8 +235,7 @@ class DeviceImages:
                 size, dai.ImgFrame.Type.RGB888i, fps=config.fps, enableUndistortion=config.undistort
             )
             stereo = pipeline.create(dai.node.StereoDepth)
-            stereo.setLeftRightCheck(True)
-            stereo.setSubpixel(True)
+            set_up(stereo, config)
             for socket, eye in ((_LEFT, stereo.left), (_RIGHT, stereo.right)):
                 camera_node = pipeline.create(dai.node.Camera).build(socket)
                 camera_node.requestOutput(_STEREO_SIZE, fps=config.fps).link(eye)
@@ -274,6 +255,19 @@ class DeviceImages:
         except BaseException:
             device.close()
             raise
+
+
+def set_up(stereo: dai.node.StereoDepth, config: OakConfig) -> None:
+    """Give the node that computes depth its preset and the least confidence."""
+    if config.preset is None:
+        stereo.setLeftRightCheck(True)
+        stereo.setSubpixel(True)
+    else:
+        stereo.setDefaultProfilePreset(dai.node.StereoDepth.PresetMode.__members__[config.preset])
+        # some presets halve the depth image, which then is not that of the colour image
+        stereo.initialConfig.postProcessing.decimationFilter.decimationFactor = 1
+    if config.confidence is not None:
+        stereo.initialConfig.setConfidenceThreshold(config.confidence)
 
 
 def open_oak(device_id: str = "", camera: Camera | None = None, config: OakConfig | None = None) -> OakSource:

@@ -13,7 +13,7 @@ from foundation.archive import is_archive, members
 from perception.sources.frame import Frame, Source
 from perception.sources.image_files import colour_to_rgb, decoded, read_png
 from perception.sources.log_messages import first_messages, open_log
-from perception.sources.open_source import VIDEO_SUFFIXES, open_source
+from perception.sources.open_source import VIDEO_SUFFIXES, is_holistic, open_source
 from perception.sources.reader import Reader
 from perception.sources.ros_images import to_rgb
 from perception.sources.topics import colour_topic
@@ -49,7 +49,8 @@ def open_pictures(source: Path | str) -> tuple[Iterator[Picture], int | None]:
     archive, camera = split_name(path)
     if is_archive(archive):
         return _archived(archive, camera or "left")
-    if str(source).partition(":")[0] in ("oak", "webcam") or path.suffix in VIDEO_SUFFIXES or not path.exists():
+    live = str(source).partition(":")[0] in ("oak", "webcam")
+    if live or path.suffix in VIDEO_SUFFIXES or is_holistic(path) or not path.exists():
         opened = open_source(source)
         return _newest(opened) if opened.live else pictures_of(opened), None
     if path.is_dir():

@@ -1,4 +1,4 @@
-"""Settings of recordings. Standard library only: the command line reads them without OpenCV."""
+"""Settings of recordings and of OAK cameras. Standard library only: the command line reads them without OpenCV."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,3 +39,34 @@ class RecordConfig:
             raise ValueError(
                 f"flush_s {self.flush_s:g}, chunk_bytes {self.chunk_bytes} and waiting {self.waiting} must be positive"
             )
+
+
+OakPreset = Literal[
+    "FAST_ACCURACY", "FAST_DENSITY", "DEFAULT", "FACE", "HIGH_DETAIL", "ROBOTICS", "DENSITY", "ACCURACY"
+]
+
+
+@dataclass(frozen=True)
+class OakConfig:
+    """How an OAK camera is used."""
+
+    width: int = 640  # px, of colour and depth
+    height: int = 480  # px
+    fps: float = 30.0
+    preset: OakPreset | None = None
+    """Preset of DepthAI's StereoDepth; None: its defaults with the left-right check and subpixels."""
+    confidence: int | None = None
+    """0 to 255, threshold of the disparity's confidence as DepthAI counts it: less keeps fewer and surer pixels; the
+    others have no depth. None: the preset's."""
+    tolerance_ms: float = 10.0  # between colour and depth of one frame
+    undistort: bool = True  # by the device, which aligns depth to the undistorted image: else they differ at the edges
+    silence_s: float = 5.0  # without a frame: the camera counts as lost
+    retry_s: float = 0.5  # after a loss, doubled up to `longest_retry_s`
+    longest_retry_s: float = 8.0
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height", "fps", "tolerance_ms", "silence_s", "retry_s", "longest_retry_s"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"oak: {name} is {getattr(self, name)}; give more than 0")
+        if self.confidence is not None and not 0 <= self.confidence <= 255:
+            raise ValueError(f"oak: confidence is {self.confidence}; give 0 to 255")
