@@ -111,7 +111,7 @@ def live(config: LiveConfig, out: Console, err: Console) -> None:
 
 def _open(config: LiveConfig, bus: Bus) -> Source:
     if config.source == "topic":
-        return TopicSource(bus, config.topic)
+        return TopicSource(bus, config.topic, config.segment)
     camera = None if config.camera is None else read_camera(config.camera)
     source = open_source(config.source, camera, TopicNames(config.colour_topic, config.depth_topic), config.oak)
     return Playback(source, config.pace) if isinstance(source, Log) else source

@@ -105,6 +105,8 @@ class TopicConfig:
     colour: str = "/camera/color/image_raw"
     depth: str | None = "/camera/aligned_depth_to_color/image_raw"  # aligned to colour; None: frames without depth
     info: str = "/camera/color/camera_info"
+    detections: str | None = None  # vision_msgs/Detection2DArray of a detector: what is in its boxes is inferred, alone
+    least_score: float = 0.3  # of a detection
     rectified: bool | None = None  # images are rectified: the info's P, no distortion; None: rectified if
     # the colour topic's name has a part rect or rectified
     aligned: bool = False  # depth is aligned to colour although its frame_id differs
@@ -116,6 +118,8 @@ class TopicConfig:
     def __post_init__(self) -> None:
         if not (self.tolerance_ms >= 0 and self.silence_s > 0 and self.waiting >= 1):
             raise ValueError("tolerance_ms must not be negative, silence_s be positive, and waiting be 1 or more")
+        if not 0.0 <= self.least_score <= 1.0:
+            raise ValueError(f"topic: least_score is {self.least_score:g}; give 0 to 1")
         if self.depth is not None and (word := named_otherwise(self.depth)):
             raise ValueError(f"topic: depth is {self.depth}, whose name says {word}; give the camera's depth image")
 

@@ -1,12 +1,18 @@
-"""Frames from any ROS 2 camera driver, over the bus: image, depth and camera_info topics, paired by their stamps."""
+"""Frames from any ROS 2 camera driver, over the bus: image, depth and camera_info topics, paired by their stamps.
+
+Detections of another node, if wanted, become the frames' label maps."""
 
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 from node.ros.bus import Bus
+from node.ros.detections import DETECTIONS_IN, BoxPx, boxes_of
 from node.ros.settings import TopicConfig
+from perception.observation.segmentation import label_boxes
+from perception.observation.settings import SegmentConfig
 from perception.sources.frame import Frame
 from perception.sources.ros_camera import is_empty, to_camera
 from perception.sources.ros_images import stamp_ns, to_depth, to_rgb
@@ -17,29 +23,33 @@ from perception.sources.topics import doubt, frame_of, not_aligned, other_camera
 _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 
 
+_DETECTING = 6  # times as many images wait where a detector takes its time
+
+
 class TopicSource:
     """A live source: iterate over it for the newest frames. Frames that arrive while one is processed are skipped.
 
     `notes` reports what was missing or wrong, once a kind and how often. `dropped` counts the colour images without
-    depth, `skipped` the frames that came too fast. It listens until `bus` ends; `close` ends an iteration.
+    depth, `skipped` the frames that came too fast, or that have no detections where these are wanted. It listens until
+    `bus` ends; `close` ends an iteration.
     """
 
     live = True
 
-    def __init__(self, bus: Bus, config: TopicConfig | None = None) -> None:
+    def __init__(self, bus: Bus, config: TopicConfig | None = None, segment: SegmentConfig | None = None) -> None:
         self.config = c = config or TopicConfig()
         self._notes: dict[str, tuple[str, int]] = {}  # by kind: the last one, and how many
         self.dropped = self.skipped = 0
         self._changed = threading.Condition()
-        streams = () if c.depth is None else (c.depth,)
-        self._matcher: StampMatcher[Any, Any] = StampMatcher(
-            streams, round(c.tolerance_ms * 1e6), c.waiting, 2 * c.waiting
-        )
-        self._matched: tuple[Any, Any] | None = None  # the newest colour and its depth, until there is an info
+        self._segment = segment
+        streams = tuple(filter(None, (c.depth, c.detections)))
+        waiting = c.waiting if c.detections is None else _DETECTING * c.waiting
+        self._matcher: StampMatcher[Any, Any] = StampMatcher(streams, round(c.tolerance_ms * 1e6), waiting, 2 * waiting)
+        self._matched: tuple[Any, dict[str, Any]] | None = None  # the newest colour, and its depth and detections
         self._info: Any = None
         self._by_arrival = False  # some stream has no stamps
         self._heard: set[str] = set()  # topics on which something came since the last frame
-        self._newest: Frame | None = None
+        self._newest: tuple[Frame, list[BoxPx] | None] | None = None
         self._closed = False
         compressed = c.colour.endswith("/compressed")
         self._names = [bus.subscribe(c.info, _INFO, self._take_info, depth=1)]
@@ -47,6 +57,8 @@ class TopicSource:
         if c.depth is not None:
             packed = c.depth.endswith("/compressed") or c.depth.endswith("/compressedDepth")
             self._names.append(bus.subscribe(c.depth, _COMPRESSED if packed else _IMAGE, self._take_depth, depth=3))
+        if c.detections is not None:
+            self._names.append(bus.subscribe(c.detections, DETECTIONS_IN, self._take_detections, depth=10))
 
     @property
     def notes(self) -> list[str]:
@@ -67,8 +79,9 @@ class TopicSource:
                 self._changed.wait_for(lambda: self._newest is not None or self._closed, timeout=0.1)
                 if self._closed:
                     return
-                frame, self._newest = self._newest, None
+                newest, self._newest = self._newest, None
             now = time.monotonic()
+            frame = None if newest is None else self._labelled(*newest)
             if frame is not None:
                 yield frame
                 heard = noted = time.monotonic()
@@ -81,7 +94,7 @@ class TopicSource:
     def _why_silent(self, seconds: float) -> str:
         with self._changed:
             heard = self._heard | ({self.config.info} if self._info is not None else set())
-            wanted = (self.config.info, self.config.colour, *filter(None, [self.config.depth]))
+            wanted = (self.config.info, self.config.colour, *filter(None, [self.config.depth, self.config.detections]))
             missing = [name for name, topic in zip(self._names, wanted, strict=True) if topic not in heard]
         why = f"nothing came on {', '.join(missing)}" if missing else "no colour image found its depth"
         return f"no frame for {seconds:.1f} s: {why}; is the driver up, on this domain and with these topic names?"
@@ -110,14 +123,37 @@ class TopicSource:
             self._settle(self._matcher.push_partner(depth, self._stamp(depth, message), message))
         self._make_frame()
 
+    def _take_detections(self, message: Any) -> None:
+        topic = self.config.detections
+        assert topic is not None
+        with self._changed:
+            self._heard.add(topic)
+            self._settle(self._matcher.push_partner(topic, self._stamp(topic, message), message))
+        self._make_frame()
+
+    def _labelled(self, frame: Frame, boxes: list[BoxPx] | None) -> Frame | None:
+        """The frame with the things in the boxes as its label map; None: nothing is to be seen in them."""
+        if boxes is None:
+            return frame
+        try:
+            label, why = label_boxes(frame, boxes, self._segment)
+        except ValueError as error:
+            self._note("detections", f"detections are left out: {error}")
+            return None
+        for reason in why:
+            self._note("a detection", f"a detection is left out: {reason}")
+        return replace(frame, label=label)
+
     def _settle(self, matches: list[Match[Any, Any]]) -> None:
         """Keep the newest pair, and count dropped pairs. The caller holds the lock."""
         depth = self.config.depth
         for match in matches:
-            found = None if depth is None else match.partners[depth]
-            if depth is None or found is not None:
+            if depth is None or match.partners[depth] is not None:
+                if self.config.detections is not None and match.partners[self.config.detections] is None:
+                    self.skipped += 1
+                    continue
                 self.skipped += self._matched is not None and self._info is not None
-                self._matched = match.lead, found
+                self._matched = match.lead, match.partners
                 continue
             self.dropped += 1
             if (gap := match.gaps_ns[depth]) < float("inf"):
@@ -132,18 +168,22 @@ class TopicSource:
         with self._changed:
             if self._info is None or self._matched is None:
                 return
-            ((stamp, colour), depth), self._matched = self._matched, None
-            info = self._info
+            ((stamp, colour), partners), self._matched = self._matched, None
+            info, c = self._info, self.config
         try:
-            frame = self._frame(stamp, colour, depth, info)
+            frame = self._frame(stamp, colour, None if c.depth is None else partners[c.depth], info)
+            boxes = None
+            if c.detections is not None:
+                size = frame.camera.width, frame.camera.height
+                boxes = boxes_of(partners[c.detections], frame.frame_id, size, c.least_score)
         except ValueError as error:
             self._note("left out", f"frames are left out: {error}")
             raise ValueError(f"a frame is left out: {error}") from None  # the bus counts it
         with self._changed:
             self._heard.clear()
             self.skipped += self._newest is not None
-            if self._newest is None or frame.stamp_ns > self._newest.stamp_ns:
-                self._newest = frame
+            if self._newest is None or frame.stamp_ns > self._newest[0].stamp_ns:
+                self._newest = frame, boxes
             self._changed.notify_all()
 
     def _frame(self, stamp: int, colour: Any, depth: Any, info: Any) -> Frame:

@@ -5,7 +5,7 @@ With depth the plane is measured. Without, it is supposed (`PlaneGuess`) and col
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import overload
 
@@ -171,6 +171,29 @@ def _supports(points: Float[np.ndarray, "h w 3"], frame: Frame, config: SegmentC
         with suppress(ValueError):
             return [supposed_plane(frame, config.guess)]
     return candidates(points, config)
+
+
+def label_boxes(
+    frame: Frame, boxes: Sequence[tuple[int, int, int, int]], config: SegmentConfig | None = None
+) -> tuple[Int[np.ndarray, "h w"], list[str]]:
+    """A label map of the things in boxes (x0 y0 x1 y1, px; ends exclusive), with the boxes' numbers from 1 as ids, and
+    why some boxes have none.
+
+    A pixel of several is the first one's. Raises `ValueError` where the frame has no plane.
+    """
+    config, label, why = config or SegmentConfig(), np.zeros(frame.rgb.shape[:2], np.int32), list[str]()
+    points = None if frame.depth is None else backproject(frame)
+    supports = [] if points is None else _supports(points, frame, config)
+    for number, box in enumerate(boxes, start=1):
+        try:
+            if points is not None:
+                mask = in_box(points, box, supports, config).mask
+            else:
+                mask = label_colour(frame, replace(config.mask, box_px=box, before=())) == 1
+            label[mask & (label == 0)] = number
+        except ValueError as error:
+            why.append(str(error))
+    return label, why
 
 
 def _nothing(left: Sequence[LeftOut], depth: Float[np.ndarray, "h w"]) -> str:
