@@ -103,11 +103,14 @@ class Bus:
         with ExitStack() as stack:
             self._session = stack.enter_context(_open(c))
             self.node = RosNode(c.domain_id, str(self._session.zid()), c.namespace, c.name)
-            self._stack = stack.pop_all()
-        self._declare(self.node.token(0, "NN"))
-        where, met = f"@ros2_lv/{c.domain_id}/**", zenoh.handlers.Callback(self._meet, indirect=False)
-        others = self._session.liveliness().declare_subscriber(where, met, history=True)
-        self._stack.callback(others.undeclare)
+            where, met = f"@ros2_lv/{c.domain_id}/**", zenoh.handlers.Callback(self._meet, indirect=False)
+            try:
+                self._declare(self.node.token(0, "NN"))
+                others = self._session.liveliness().declare_subscriber(where, met, history=True)
+            except zenoh.ZError as error:  # the router is gone again
+                raise OSError(f"the bus cannot open ({one_line(error)}); start the node again") from None
+            stack.callback(others.undeclare)
+            self._stack = stack.pop_all()  # after all that may fail: a failed start leaves no session open
         return self
 
     def __exit__(

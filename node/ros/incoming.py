@@ -1,6 +1,8 @@
 """What comes on one topic or service: judged, counted and handled in a thread of its own, the senders in turn."""
 
 import threading
+import time
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +13,9 @@ from node.ros.message_counts import MessageCounts, Rate
 from node.ros.rmw_zenoh import read_attachment
 from node.ros.settings import BusConfig
 
-_SENDERS = 256  # whose rates and sequence numbers are remembered
+_SENDERS = 256  # whose rates and sequence numbers are remembered, the latest
+_NEWCOMERS = 64.0  # senders that may come anew in a second: names are easily made up
+_TOGETHER = 8.0  # times the rate of one sender: that of all
 
 Tag = tuple[int, bytes]  # a sample's number and its sender's gid
 
@@ -32,7 +36,9 @@ class Incoming:
         self._take, self._refuse = take, refuse
         self._setting = "max_request_bytes" if refuse else "max_message_bytes"
         self._limit: int = getattr(config, self._setting)
-        self._known: dict[bytes, _Sender] = {}
+        self._known: OrderedDict[bytes, _Sender] = OrderedDict()  # the latest last
+        self._lock = threading.Lock()
+        self._newcomers, self._together = Rate(_NEWCOMERS), Rate(_TOGETHER * config.max_rate)
         self._waiting: FairQueue[Any] = FairQueue(depth, depth * self._limit)
         self._thread = threading.Thread(target=self._loop, name=f"bus {name}", daemon=True)
         self._thread.start()
@@ -40,9 +46,15 @@ class Incoming:
     def arrive(self, item: Any) -> None:
         """In zenoh's own thread: the sender's, which waits for it, so that a flood stays where it comes from."""
         sequence, sender = _tag_or_none(item)
-        if sender not in self._known and len(self._known) >= _SENDERS:
-            self._known.pop(next(iter(self._known)), None)
-        lost = self._known.setdefault(sender, _Sender(Rate(self._config.max_rate))).lost(sequence)
+        with self._lock:
+            if sender not in self._known:
+                if not self._newcomers.allows():
+                    return self._turn_away(item)
+                if len(self._known) >= _SENDERS:
+                    self._known.popitem(last=False)
+                self._known[sender] = _Sender(Rate(self._config.max_rate))
+            self._known.move_to_end(sender)
+            lost = self._known[sender].lost(sequence)
         dropped = self._waiting.put(sender, item, _size(item))
         if self._refuse:
             for query in dropped:
@@ -50,6 +62,12 @@ class Incoming:
         if lost + len(dropped):
             flood = f"requests of one client come faster than they are answered; its newest {self._depth} wait"
             self._counts.add(self._name, "dropped", flood if self._refuse and dropped else "", lost + len(dropped))
+
+    def _turn_away(self, item: Any) -> None:
+        if self._refuse:
+            item.drop()
+        crowd = f"more than {_NEWCOMERS:g} senders a second are new; does one make up names?"
+        self._counts.add(self._name, "too_fast", crowd)
 
     def close(self) -> None:
         """End the thread, when it has handled what it has in hand; call it from any thread."""
@@ -76,8 +94,12 @@ class Incoming:
             tag = read_tag(item)
             if (size := _size(item)) > self._limit:
                 return "too_large", f"a message of {size} bytes is larger than {self._setting} ({self._limit})"
-            if (sender := self._known.get(tag[1])) is not None and not sender.rate.allows():
+            with self._lock:
+                sender = self._known.get(tag[1])
+            if sender is not None and not sender.rate.allows():
                 return "too_fast", f"messages of one sender come faster than max_rate ({self._config.max_rate:g} Hz)"
+            while not self._together.allows():  # the senders still take turns: what waits too long is dropped
+                time.sleep(1.0 / (_TOGETHER * self._config.max_rate))
             self._take(item, tag)
         except ValueError as error:
             return "refused" if self._refuse else "malformed", one_line(error)

@@ -11,7 +11,7 @@ from node.ros.octree import ID, octree_data
 from node.ros.scene_messages import object_frame_id
 from node.ros.settings import PlannerConfig
 from perception.answers.hypotheses import Hypotheses
-from perception.answers.occupied_space import DistanceField, cells, risky_surface
+from perception.answers.occupied_space import DistanceField, cells, edge_lengths, ends, risky_surface
 from perception.answers.query import marginal
 
 PLANNING_SCENE = "moveit_msgs/msg/PlanningScene"
@@ -19,6 +19,7 @@ OCTOMAP = "octomap_msgs/msg/Octomap"
 DETECTIONS = "vision_msgs/msg/Detection3DArray"
 ESDF = "nvblox_msgs/srv/EsdfAndGradients"
 _ADD, _REMOVE = 0, 1  # operations of a CollisionObject
+_REMOVALS = 3  # messages that say so: one may be lost, and nobody asks for it again
 _SURE = 1e-3  # probabilities nearer to 0 or 1 are written as this near: log-odds are finite
 
 
@@ -30,21 +31,26 @@ class SceneDifferences:
         self._node, self._config = node, config
         self._told: dict[str, str] = {}  # names of objects that MoveIt knows, with their frames
         self._next: dict[str, str] = {}
+        self._removed: dict[str, tuple[str, int]] = {}  # names with their frames, and in how many messages yet
+        self._removing: dict[str, tuple[str, int]] = {}
 
     def message(self, objects: Sequence[Hypotheses]) -> Any | None:
-        """A moveit_msgs/PlanningScene with `is_diff`, from what was `sent` last to `objects`; None: both are empty.
+        """A moveit_msgs/PlanningScene with `is_diff`, from what was `sent` last to `objects`; None: there is nothing to
+        say.
 
-        An object's mesh is the surface of its space with P(occupied) > risk. One without such space is removed.
+        An object's mesh is the surface of its space with P(occupied) > risk. One without such space is removed; the
+        next messages repeat that, as one may be lost.
         """
         shapes = [collision_object(h, self._node, self._config) for h in objects]
         shapes = [shape for shape in shapes if shape.meshes]
         self._next = {shape.id: shape.header.frame_id for shape in shapes}
-        if not self._told and not self._next:
+        removing = self._removed | {name: (frame, _REMOVALS) for name, frame in self._told.items()}
+        self._removing = {name: it for name, it in removing.items() if name not in self._next}
+        if not self._removing and not self._next:
             return None
         gone = [
             make("moveit_msgs/msg/CollisionObject", header=header(0, frame), id=name, operation=_REMOVE)
-            for name, frame in self._told.items()
-            if name not in self._next
+            for name, (frame, _) in self._removing.items()
         ]
         world = {"collision_objects": [*gone, *shapes]}
         if self._config.scene_octomap:
@@ -59,6 +65,7 @@ class SceneDifferences:
     def sent(self) -> None:
         """The last message went out: the next one is a difference to it."""
         self._told = self._next
+        self._removed = {name: (frame, left - 1) for name, (frame, left) in self._removing.items() if left > 1}
 
     def _octomap(self, objects: Sequence[Hypotheses]) -> Any:
         """An octomap_msgs/OctomapWithPose. MoveIt keeps the one that it has where another one has no data: without
@@ -69,7 +76,7 @@ class SceneDifferences:
             frame, T, stamp = first.frame_id, first.object_frame.T_camera_object, first.stamp_ns
             octomap = octomap_message(objects, self._node, self._config.octomap_m)
         else:
-            frame, T, stamp = next(iter(self._told.values())), np.eye(4), 0
+            frame, T, stamp = next(iter(self._removing.values()))[0], np.eye(4), 0
             octomap = _octomap(np.zeros((1, 3), int), np.zeros(1), self._config.octomap_m, header(0, frame))
         return make("octomap_msgs/msg/OctomapWithPose", header=header(stamp, frame), origin=pose(T), octomap=octomap)
 
@@ -126,7 +133,8 @@ def _octomap(where: Int[np.ndarray, "n 3"], p: Float[np.ndarray, "n"], width: fl
 def detections_message(objects: Sequence[Hypotheses]) -> Any:
     """The objects as vision_msgs/Detection3DArray, in the camera's frame.
 
-    A box is upright, with the weighted medians of the hypotheses' ends; the covariance is that of their middles (m^2).
+    A box is upright, as large as the `Summary` says, in the middle of the weighted medians of the hypotheses' ends; the
+    covariance is that of their middles (m^2).
     Results are what kind of thing it may be, with probabilities; none where the prior does not tell.
     """
     top = header(objects[0].stamp_ns, objects[0].frame_id)
@@ -134,7 +142,7 @@ def detections_message(objects: Sequence[Hypotheses]) -> Any:
 
 
 def _detection(h: Hypotheses, top: Any) -> Any:
-    low, high = _ends(h)
+    low, high = ends(h)
     middle = 0.5 * (low + high)
     place = h.object_frame.T_camera_object.copy()
     box = [np.quantile(end, 0.5, axis=0, weights=h.weights, method="inverted_cdf") for end in (low, high)]
@@ -151,7 +159,7 @@ def _detection(h: Hypotheses, top: Any) -> Any:
         )
         for kind, p in sorted(h.kinds.items(), key=lambda item: -item[1])
     ]
-    edges = make("geometry_msgs/msg/Vector3", **dict(zip("xyz", (box[1] - box[0]).tolist(), strict=True)))
+    edges = make("geometry_msgs/msg/Vector3", **dict(zip("xyz", edge_lengths(h).tolist(), strict=True)))
     return make(
         "vision_msgs/msg/Detection3D",
         header=top,
@@ -159,17 +167,6 @@ def _detection(h: Hypotheses, top: Any) -> Any:
         bbox=make("vision_msgs/msg/BoundingBox3D", center=pose(place), size=edges),
         id=str(h.object_id),
     )
-
-
-def _ends(h: Hypotheses) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S 3"]]:
-    """Lowest and highest coordinates of each hypothesis (m, object frame); of an empty one the origin."""
-    ends = np.zeros((2, len(h.weights), 3))
-    for s, shape in enumerate(h.solid):
-        for axis in range(3):
-            filled = np.flatnonzero(shape.any(axis=tuple({0, 1, 2} - {axis})))
-            if len(filled):
-                ends[:, s, axis] = np.array([filled[0], filled[-1] + 1]) * h.voxel_m - h.object_frame.half_extent
-    return ends[0], ends[1]
 
 
 def esdf_response(field: DistanceField, stamp_ns: int, frame_id: str, unknown: float) -> Any:

@@ -148,3 +148,21 @@ def _count(first: Int[np.ndarray, "3"], last: Int[np.ndarray, "3"]) -> tuple[int
 def _above(h: Hypotheses) -> Bool[np.ndarray, "V"]:
     """The voxels above the table."""
     return np.broadcast_to(above_plane(h.grid), h.seen.shape).ravel()
+
+
+def ends(h: Hypotheses) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S 3"]]:
+    """Lowest and highest coordinates of each hypothesis (m, object frame); of an empty one the origin."""
+    found = np.zeros((2, len(h.weights), 3))
+    for s, shape in enumerate(h.solid):
+        for axis in range(3):
+            filled = np.flatnonzero(shape.any(axis=tuple({0, 1, 2} - {axis})))
+            if len(filled):
+                found[:, s, axis] = np.array([filled[0], filled[-1] + 1]) * h.voxel_m - h.object_frame.half_extent
+    return found[0], found[1]
+
+
+def edge_lengths(h: Hypotheses) -> Float[np.ndarray, "3"]:
+    """How large the object is along each axis of its frame (m): the weighted median of the hypotheses."""
+    low, high = ends(h)
+    voxels = np.rint((high - low) / h.voxel_m)  # equal ones must be equal, or the median is any of them
+    return np.quantile(voxels, 0.5, axis=0, weights=h.weights, method="inverted_cdf") * h.voxel_m

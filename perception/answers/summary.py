@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.next_view import rank_views
+from perception.answers.occupied_space import edge_lengths
 from perception.answers.query import CAUTION
 from probnerf.rendering.occupancy import voxel_centres
 
@@ -62,12 +63,7 @@ def summarise(h: Hypotheses) -> Summary:
 
 def size(h: Hypotheses) -> Float[np.ndarray, "3"]:
     """Width, depth and height (m): per axis of the object frame the weighted median of the shapes' extents."""
-    extents = np.zeros((len(h.weights), 3))
-    for extent, shape in zip(extents, h.solid, strict=True):
-        for axis in range(3):
-            filled = np.flatnonzero(shape.any(axis=tuple({0, 1, 2} - {axis})))
-            extent[axis] = h.voxel_m * (filled[-1] - filled[0] + 1) if len(filled) else 0.0
-    x, y, z = np.quantile(extents, 0.5, axis=0, weights=h.weights, method="inverted_cdf")
+    x, y, z = edge_lengths(h)
     return np.array([y, x, z])
 
 

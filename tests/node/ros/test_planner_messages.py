@@ -17,6 +17,7 @@ from node.ros.settings import PlannerConfig
 from perception.answers.occupied_space import distance_field, risky_surface
 from perception.answers.query import query
 from perception.answers.regions import Points
+from perception.answers.summary import size
 from tests.node.ros.test_octree import leaves
 from tests.node.shapes import BODY, GRID, HALF_EXTENT, RIGHT, STAMP_NS, body_with_handle
 
@@ -58,11 +59,24 @@ def test_objects_come_and_go() -> None:
     for _ in range(2):
         assert operations(there_and_back(scene.message([two]))) == [("farside_object_1", 1), ("farside_object_2", 0)]
     scene.sent()
+    assert operations(scene.message([one, two])) == [("farside_object_1", 0), ("farside_object_2", 0)]  # back again
     empty = replace(two, opacity=np.zeros_like(two.opacity))
+    gone = [("farside_object_1", 1), ("farside_object_2", 1)]
     for objects in ([], [empty]):
-        assert operations(there_and_back(scene.message(objects))) == [("farside_object_2", 1)]
-    scene.sent()
+        assert operations(there_and_back(scene.message(objects))) == gone
+    for said in (gone, gone, gone[1:]):  # each three times: one message may be lost
+        assert operations(scene.message([])) == said
+        scene.sent()
     assert scene.message([]) is None
+    scene.message([one])
+    scene.sent()
+    assert operations(scene.message([])) == [("farside_object_1", 1)]
+
+
+def test_a_detection_is_as_large_as_the_summary_says() -> None:
+    h = body_with_handle()
+    edges = detections_message([h]).detections[0].bbox.size
+    np.testing.assert_allclose([edges.y, edges.x, edges.z], size(h), rtol=1e-12)
 
 
 def test_the_scenes_octomap_lies_where_the_object_does_and_is_emptied() -> None:
