@@ -69,8 +69,8 @@ class HandEyeOptions:
     source: Annotated[Positional[str], arg(metavar="PICTURES")]
     """Folder of images, in the order of their names."""
     poses: Annotated[Path, arg(metavar="FILE")]
-    """T_base_gripper at each picture: .csv or .txt with x y z qx qy qz qw in a row (m; perhaps after the picture's
-    name), .json or .yaml with a list of ROS's Pose or Transform, or of 4x4 matrices."""
+    """T_base_gripper at each picture: .csv or .txt with rows of x y z qx qy qz qw (m; perhaps after a picture's name),
+    .json or .yaml with a list of ROS's Pose or Transform, or of 4x4 matrices."""
     camera: Annotated[
         Path | None, arg(metavar="FILE.yaml", help_behavior_hint="(default: calibrated from the pictures)")
     ] = None

@@ -85,10 +85,11 @@ def live(config: LiveConfig, out: Console, err: Console) -> None:
         stack.enter_context(reader)
         keeper.thread.start()
         frames = FrameTree(bus)
-        if mounting is not None:
-            frames.mount(bus, mounting)
         answers = Answers(announcer.node, config.planner, frames, clock)
         node = LiveNode(config, tracker, announcer, answers, reader, keeper, recorder, err)
+        if mounting is not None:
+            frames.mount(bus, mounting)
+            node.placed = mounting.camera
         answers.serve(bus)
         serve_parameters(bus, flat(config) | {"use_sim_time": config.bus.use_sim_time})
         serve_type_descriptions(bus)
@@ -185,6 +186,7 @@ class LiveNode:
         self.keeper, self.recorder, self.err = keeper, recorder, err
         self.answers = answers
         self.show: Callable[..., None] | None = None
+        self.placed: str | None = None  # frame of the camera that --hand-eye places
         self.frames = self.inferences = self.answered = 0
         self._scene: dict[int, Hypotheses] = {}
         self._said: dict[str, int] = {}  # what went wrong, and how often
@@ -220,6 +222,8 @@ class LiveNode:
 
     def take(self, frame: Frame, out: Console) -> None:
         """Process one frame: first publish its objects' present hypotheses, then infer what the frame adds."""
+        if self.placed not in (None, frame.frame_id):
+            self._trouble(f"--hand-eye places {self.placed!r}, but pictures are of {frame.frame_id!r}: correct it")
         if self.config.source == "topic":  # publish again the driver's frames that are inferred from
             self.announcer.frame(frame)
         try:

@@ -14,10 +14,13 @@ import jax
 import numpy as np
 import pytest
 
+from calibration.hand_eye import hand_eye
+from calibration.pose_files import write_hand_eye
 from node.__main__ import main
 from node.commands.config_file import load_config
 from node.commands.options import LiveConfig
 from node.ros.bus import Bus
+from node.ros.frame_tree import FrameTree
 from node.ros.messages import HYPOTHESES, NEXT_VIEW, QUERY_REGION, hypotheses_from, make
 from node.ros.settings import BusConfig
 from node.viewer.page import Page
@@ -27,6 +30,7 @@ from perception.sources.recording import Log
 from perception.sources.settings import SHIPPED_LOG
 from probnerf.prior.checkpoint import save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
+from tests.calibration.robots import CAMERA, posed_views
 from tests.conftest import ROOT
 from tests.node.commands.test_replay_whole import FEW
 from tests.node.pretend_inference import pretend_live
@@ -45,6 +49,7 @@ def test_the_launch_file_is_the_defaults() -> None:
         (["nowhere.mcap"], "nowhere.mcap does not exist"),
         (["oak"], "no OAK camera|oak"),
         (["webcam:99"], "webcam:99|camera 99"),
+        (["--hand-eye", "/nowhere.yaml"], "nowhere.yaml: no such file; `farside hand-eye` writes one"),
         (["--budget", "0"], "the budget is 0 s; give more than 0"),
         ([str(SHIPPED_LOG), "--record", "/proc/none/a.mcap"], "/proc/none/a.mcap cannot be written|No such file"),
     ],
@@ -80,9 +85,20 @@ def test_a_page_shows_what_the_node_infers(
     save_prior(tmp_path / "tiny.safetensors", ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {})
     (tmp_path / "live.yaml").write_text("bus: {listen: [tcp/127.0.0.1:0]}")
     options = ["--prior", str(tmp_path / "tiny.safetensors"), "--config", str(tmp_path / "live.yaml")]
+    result, mounted, mount = hand_eye(posed_views("in-hand", count=6), CAMERA), list[Any](), FrameTree.mount
+
+    def place(self: FrameTree, bus: Bus, camera: Any) -> None:
+        mount(self, bus, camera)
+        mounted.append(self.T("tool0", "wrist", 0))
+
+    monkeypatch.setattr(FrameTree, "mount", place)
+    write_hand_eye(tmp_path / "hand_eye.yaml", result, "tool0", "wrist")
+    options += ["--hand-eye", str(tmp_path / "hand_eye.yaml")]
     assert main(["live", str(SHIPPED_LOG), *options, "--page", str(port)]) == 0
     said = capsys.readouterr()
-    assert f"http://127.0.0.1:{port} shows it" in said.out and not said.err
+    np.testing.assert_allclose(mounted, [result.T_parent_camera], atol=1e-9)
+    assert "--hand-eye places 'wrist', but pictures are of" in said.err and said.err.count("\n") <= 2
+    assert f"http://127.0.0.1:{port} shows it" in said.out
     assert {stamp for stamp, _, _ in shown} <= {frame.stamp_ns for frame in Log(SHIPPED_LOG)}
     scenes = [scene for _, scene, _ in shown[:4]]  # of the first frame: first answers of all, then the last ones
     first, last = "underway", "converged"
