@@ -7,16 +7,17 @@ them: what is beside, in front, missing and mistaken.
 """
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from perception.observation.settings import ObserveConfig
-from perception.simulation.ray_caster import RayCaster
+from perception.simulation.ray_caster import Hits, RayCaster
 from probnerf.geometry import look_at, pinhole_rays
 from probnerf.prior.encoder_input import ENCODER_RADIUS
-from probnerf.training.learnt_objects import LearntObject
+from probnerf.training.learnt_objects import Colours, LearntObject
 from probnerf.types import Pose, on_device
 
 
@@ -49,17 +50,50 @@ class TrainingPicture:
     pose: Float[np.ndarray, "4"]  # x, y, log-scale, z in units of `pose_sigma`
 
 
+class Pictured(Protocol):
+    """What a picture is taken of."""
+
+    @property
+    def half_extent(self) -> float:
+        """m per cube unit."""
+        ...
+
+    @property
+    def colours(self) -> Colours:
+        """Of its surface."""
+        ...
+
+
+class Caster(Protocol):
+    """Where rays meet it."""
+
+    def cast(self, origins: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]) -> Hits:
+        """Of unit directions from one place (cube units)."""
+        ...
+
+
 def draw_plain(
-    rng: np.random.Generator, thing: LearntObject, views: int, size: int, draws: PlainDraws | None = None
+    rng: np.random.Generator,
+    thing: Pictured,
+    views: int,
+    size: int,
+    draws: PlainDraws | None = None,
+    caster: Caster | None = None,
 ) -> list[TrainingPicture]:
-    """So many views of an object, from any side; none of those in which it covers no pixel."""
-    draws, caster = draws or PlainDraws(), RayCaster([(thing.vertices, thing.faces)])
+    """So many views of an object, from any side; none of those in which it covers no pixel.
+
+    Its mesh meets the rays, if `caster` does not.
+    """
+    draws = draws or PlainDraws()
+    if caster is None:
+        assert isinstance(thing, LearntObject), "what has no mesh needs a caster"
+        caster = RayCaster([(thing.vertices, thing.faces)])
     pictures = (_view(rng, thing, caster, size, draws) for _ in range(views))
     return [picture for picture in pictures if picture is not None]
 
 
 def _view(
-    rng: np.random.Generator, thing: LearntObject, caster: RayCaster, size: int, draws: PlainDraws
+    rng: np.random.Generator, thing: Pictured, caster: Caster, size: int, draws: PlainDraws
 ) -> TrainingPicture | None:
     yaw, sigma, drawn = _pose(rng, thing.half_extent, draws)
     x, y, log_scale, z = drawn * sigma[[0, 1, 2, 4]]

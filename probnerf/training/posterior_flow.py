@@ -22,6 +22,7 @@ from probnerf.prior.posterior_network import EncoderPicture
 from probnerf.training.picture_set import Examples, PictureSet, changed, split
 from probnerf.training.run_folder import RunFolder
 from probnerf.training.settings import PosteriorTrainConfig
+from probnerf.types import KINDS
 
 
 class PosteriorTrainState(eqx.Module):
@@ -52,13 +53,14 @@ def log_densities(
 ) -> tuple[Float[Array, "b"], Float[Array, "b"], Float[Array, "b"], Float[Array, "b"]]:
     """log q of yaw, of (x, y, log-scale), of z~ and of the kind for each example.
 
-    The first two are 0 where the pose is given.
+    The first two are 0 where the pose is given, the last where the kind is untold (`len(KINDS)` or more).
     """
 
     def one(picture: EncoderPicture, sigma, given, yaw, pose, z, kind):
         features = network.features(picture, sigma, given=given)
         parts = network.log_density_parts(features, yaw[None], pose[None], z[None])
-        return *(part[0] for part in parts), features.log_kinds[kind]
+        told = features.log_kinds[jnp.minimum(kind, len(KINDS) - 1)]
+        return *(part[0] for part in parts), jnp.where(kind < len(KINDS), told, 0.0)
 
     seen = _as_floats(examples.picture)
     told = (examples.pose_sigma, examples.known, examples.yaw, examples.pose, z_tilde, examples.kind)

@@ -1,0 +1,263 @@
+"""Train a prior's network on objects, scenes and the model's own draws: `python -m benchmarks.household.network`.
+
+A network that has seen the same objects hundreds of times knows them by heart: the one that
+`benchmarks.household.train` leaves has a training loss of 108 nats and one of 169 on other objects. So a share of each
+batch is pictures of the prior's own shapes (`perception.simulation.model_pictures`), and others are of new objects.
+Training ends at its time; the learning rate follows the clock.
+"""
+
+import json
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field, fields
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import tyro
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from benchmarks.harness.machine import revision
+from benchmarks.harness.progress import say
+from benchmarks.household.objects import SIZE
+from benchmarks.household.train import told_pictures
+from foundation.whole_file import whole_file
+from foundation.worker_pool import worker_pool
+from perception.simulation.model_pictures import draw_shape
+from perception.simulation.plain_pictures import PlainDraws
+from perception.simulation.training_pictures import PicturePart
+from probnerf.prior.checkpoint import (
+    Prior,
+    load_prior,
+    load_recognition,
+    network_path,
+    recognition_path,
+    save_posterior_network,
+)
+from probnerf.prior.networks import RealNVP
+from probnerf.prior.posterior_flow import NetworkSizes, PosteriorNetwork
+from probnerf.training import posterior_flow
+from probnerf.training.picture_set import Examples, PictureSet, changed
+from probnerf.training.settings import PosteriorTrainConfig
+from probnerf.training.shape_set import batch_of, load_shapes
+from probnerf.types import on_device
+
+UNTOLD = 255  # the kind of a draw of the model
+OWN = 0.6  # of the model's draws, those of N(0, I); the others are what recognition tells of objects
+SHAPES, VIEWS = 250, 2  # of a part of the model's draws
+SIZES = NetworkSizes(latent=96, context=320, trunk=320, hidden=320, condition=160)
+State = tuple[PosteriorNetwork, PosteriorNetwork, optax.OptState]  # weights, their moving average, the optimiser's
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train the posterior network of a prior for a given time."""
+
+    prior: Path
+    """Weights; training begins at the network beside them, if there is one. The recognition must lie there, too."""
+    work: Path
+    """Folder with the shapes and pictures that `benchmarks.household.train` (or `objects.make`) left."""
+    out: Path = Path("runs/household-network")
+    """Folder of the network and its history."""
+    draws: int = 40_000
+    """Pictures of the model's own shapes; kept in WORK."""
+    seconds: float = 1800.0
+    """Of training."""
+    shares: tuple[float, float, float] = (0.34, 0.22, 0.44)
+    """Of a batch: plain pictures of objects, scenes, the model's own shapes."""
+    processes: int = 2
+    """That draw pictures."""
+    held_out: float = 0.08
+    """Share of the objects that are judged by alone; so many of the model's draws, too."""
+    recipe: tyro.conf.OmitArgPrefixes[PosteriorTrainConfig] = field(
+        default_factory=lambda: PosteriorTrainConfig(batch=128, learning_rate=6e-4, final_learning_rate=1e-6)
+    )
+
+
+@cache
+def _prior(path: Path) -> Prior:
+    return load_prior(path)
+
+
+def draw_part(number: int, weights: Path, work: Path) -> Path:
+    """A file of plain pictures of the model's own shapes, with their z as `mean`."""
+    path = work / f"model_{number:05d}.npz"
+    if path.exists():
+        return path
+    prior, rng = _prior(weights), np.random.default_rng([number, 99])
+    recognition = load_recognition(recognition_path(weights), prior)
+    sources = sorted(work.glob("*.shapes"))
+    pictures, latents, kinds = [], [], []
+    for _ in range(SHAPES):
+        z, kind = np.asarray(_forward(prior.model.flow, on_device(rng.standard_normal(prior.model.latent)))), UNTOLD
+        if sources and rng.random() >= OWN:
+            shapes = _shapes(sources[int(rng.integers(len(sources)))])
+            row = int(rng.integers(len(shapes)))
+            told = batch_of(shapes, rng, np.array([row]), 4, 1).description[0]
+            mean, precision = (np.asarray(a) for a in _recognised(recognition, told))
+            z, kind = mean + rng.standard_normal(len(mean)) / np.sqrt(precision), int(shapes.kind[row])
+        field_weights = _decoded(prior.model.hyper, on_device(z))
+        drawn = draw_shape(rng, prior.model.field, field_weights, VIEWS, SIZE, PlainDraws())
+        pictures += drawn
+        latents += [z] * len(drawn)
+        kinds += [kind] * len(drawn)
+    arrays: dict[str, Any] = {
+        name: np.stack([np.asarray(getattr(picture, name)) for picture in pictures]).astype(kind)
+        for name, kind in _TYPES.items()
+        if name != "rgb"
+    }
+    arrays["rgb"] = np.stack([np.round(255.0 * picture.rgb) for picture in pictures]).astype(np.uint8)
+    with whole_file(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, **arrays, mean=np.stack(latents).astype(np.float32), kind=np.array(kinds, np.uint8))
+    return path
+
+
+_TYPES = {
+    "rgb": np.uint8,
+    "distance": np.float16,
+    "unknown": np.uint8,
+    "T_view_camera": np.float32,
+    "tan_half_fov": np.float32,
+    "pose_sigma": np.float32,
+    "yaw": np.float32,
+    "pose": np.float32,
+}
+_shapes = cache(load_shapes)
+_recognised = eqx.filter_jit(lambda recognition, told: recognition(jnp.asarray(told)))
+_forward = eqx.filter_jit(lambda flow, z_tilde: flow.forward(z_tilde)[0])
+_decoded = eqx.filter_jit(lambda hyper, z: hyper(z))
+
+
+@dataclass(frozen=True)
+class Material:
+    """All pictures, and which rows are of which sort."""
+
+    pictures: PictureSet
+    sorts: dict[str, np.ndarray]  # rows to train on
+    held_out: dict[str, np.ndarray]
+
+
+def gathered(prior: Prior, weights: Path, work: Path, model_parts: Sequence[Path], held_out: float) -> Material:
+    """The objects' pictures, the scenes' and the model's own."""
+    recognition = load_recognition(recognition_path(weights), prior)
+    parts = {
+        sort: [PicturePart.load(path) for path in sorted(work.glob(pattern))]
+        for sort, pattern in (("objects", "*.plain"), ("scenes", "scenes-*.npz"))
+    }
+    real = told_pictures([part for each in parts.values() for part in each], recognition, prior.model.latent)
+    own: dict[str, np.ndarray] = {}
+    for path in model_parts:
+        with np.load(path) as file:
+            for name in file.files:
+                own[name] = np.concatenate([own[name], file[name]]) if name in own else file[name]
+    own |= {"sd": np.zeros_like(own["mean"]), "object_id": -1 - np.arange(len(own["mean"])) // VIEWS}
+    names = [f.name for f in fields(PictureSet)]
+    every = PictureSet(**{name: np.concatenate([getattr(real, name), own[name]]) for name in names})
+    sort = np.full(len(every), 2)
+    sort[: len(real)] = np.arange(len(real)) >= sum(len(part.rgb) for part in parts["objects"])
+    known = np.unique(every.object_id)
+    kept = np.random.default_rng(1).permutation(known)[: round(held_out * len(known))]
+    out = np.isin(every.object_id, kept)
+    rows = {name: (sort == k) for k, name in enumerate(("objects", "scenes", "model"))}
+    return Material(
+        every,
+        {name: np.flatnonzero(these & ~out) for name, these in rows.items()},
+        {name: np.flatnonzero(these & out) for name, these in rows.items()},
+    )
+
+
+@eqx.filter_jit(donate="all-except-first")
+def _step(
+    fixed: tuple[Examples, RealNVP, Float[Array, ""], Float[Array, ""], PRNGKeyArray], state: State
+) -> tuple[State, dict[str, Array]]:
+    examples, flow, rate, decay, key = fixed
+    network, average, optimiser = state
+    (_, parts), gradient = jax.value_and_grad(posterior_flow.loss, has_aux=True)(network, examples, key, flow)
+    update, optimiser = _OPTIMISER.update(gradient, optimiser)
+    network = jax.tree.map(lambda a, b: a - rate * b, network, update)
+    average = jax.tree.map(lambda a, b: decay * a + (1.0 - decay) * b, average, network)
+    return (network, average, optimiser), parts
+
+
+_OPTIMISER = optax.chain(optax.clip_by_global_norm(PosteriorTrainConfig.clip), optax.scale_by_adam())
+
+
+def rate_at(share: float, recipe: PosteriorTrainConfig) -> float:
+    """The learning rate when this share of the time is over: a short rise, then a half cosine."""
+    wave = 0.5 * (1.0 + np.cos(np.pi * share))
+    peak, final = recipe.learning_rate, recipe.final_learning_rate
+    return min(1.0, share / 0.02) * (final + (peak - final) * wave)
+
+
+def judged(
+    network: PosteriorNetwork, material: Material, flow: RealNVP, recipe: PosteriorTrainConfig
+) -> dict[str, dict[str, float]]:
+    """The parts of the loss on held-out pictures of each sort, nats."""
+    found = {}
+    for name, rows in material.held_out.items():
+        if len(rows) >= recipe.batch:
+            parts = posterior_flow.validate(network, material.pictures, rows, recipe, flow)
+            found[name] = {key.removeprefix("validation_"): round(value, 2) for key, value in parts.items()}
+    return found
+
+
+def main(options: Options) -> None:
+    """Draw what is missing, train, and write the network."""
+    prior, recipe, out = load_prior(options.prior), options.recipe, options.out
+    out.mkdir(parents=True, exist_ok=True)
+    options.work.mkdir(parents=True, exist_ok=True)
+    count = -(-options.draws // (SHAPES * VIEWS))
+    with worker_pool(options.processes) as pool:
+        jobs = [pool.submit(draw_part, n, options.prior, options.work) for n in range(count)]
+        drawn = [job.result() for job in jobs]
+    material = gathered(prior, options.prior, options.work, drawn, options.held_out)
+    say(str({name: len(rows) for name, rows in material.sorts.items()}))
+    flow, pictures = prior.model.flow, material.pictures
+    start = prior.network or PosteriorNetwork(SIZES, jax.random.key(recipe.seed))
+    say(f"begins at {judged(start, material, flow, recipe)}")
+    sizes = np.random.default_rng(0).multinomial(recipe.batch, np.array(options.shares) / sum(options.shares))
+
+    def data_of(step: int) -> Examples:
+        rng = np.random.default_rng([recipe.seed, step, 7])
+        rows = [rng.choice(r, n) for r, n in zip(material.sorts.values(), sizes, strict=True) if len(r)]
+        return changed(pictures, np.concatenate(rows), rng, recipe)
+
+    state: State = (*(jax.tree.map(jnp.copy, start) for _ in range(2)), _OPTIMISER.init(start))
+    begun, told, step, sums = time.monotonic(), time.monotonic(), 0, list[dict[str, Array]]()
+    story: dict[str, Any] = {"recipe": asdict(recipe), "pictures": sum(map(len, material.sorts.values()))}
+    story |= {"shares": options.shares, "seconds": options.seconds, "revision": revision()}
+    path = network_path(out / "prior.safetensors")
+    with ThreadPoolExecutor(1) as drawer:
+        coming = drawer.submit(data_of, 0)
+        while (share := (time.monotonic() - begun) / options.seconds) < 1.0:
+            examples, coming = coming.result(), drawer.submit(data_of, step + 1)
+            decay = min(recipe.average, (1.0 + step) / (10.0 + step))
+            key = jax.random.fold_in(jax.random.key(recipe.seed), step)
+            fixed = (examples, flow, jnp.float32(rate_at(share, recipe)), jnp.float32(decay), key)
+            state, parts = _step(fixed, state)
+            step += 1
+            sums.append(parts)
+            if time.monotonic() - told > 60.0:
+                told = time.monotonic()
+                row: dict[str, Any] = {"step": step, "share": round(share, 3)}
+                row |= {name: round(float(np.mean([float(s[name]) for s in sums])), 2) for name in parts}
+                sums.clear()
+                if not all(np.isfinite(value) for value in row.values()):
+                    raise FloatingPointError(f"the loss is not finite at step {step}")
+                with (out / "network_history.jsonl").open("a") as file:
+                    file.write(json.dumps(row) + "\n")
+                save_posterior_network(path, state[1], prior.hash, story | {"steps": step})
+                say(json.dumps(row))
+    found = judged(state[1], material, flow, recipe)
+    save_posterior_network(path, state[1], prior.hash, story | {"steps": step, "validation": found})
+    say(f"{path}: {step} steps, {found}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
