@@ -4,13 +4,14 @@ A job's work depends on its numbers alone. Four families: tabletop objects, the 
 variants of a folder's meshes, and those of a folder of Infinigen's objects (`probnerf.training.infinigen`).
 """
 
-import pickle
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from foundation.whole_file import whole_file
 from perception.simulation.training_pictures import LOOKS, draw_plain_views, draw_views
 from probnerf.objects.household import draw_mesh
 from probnerf.objects.mesh import MeshObject, mesh_files, read_mesh
@@ -74,9 +75,7 @@ def make(job: Job, out: Path) -> Made | str:
         return f"{job.name}: {error!r}"
     shapes.save(made.shapes)
     plain.save(made.plain)
-    part = made.things.with_suffix(".part")
-    part.write_bytes(pickle.dumps(things))
-    part.replace(made.things)
+    save_things(made.things, things)
     return replace(made, count=len(shapes))
 
 
@@ -85,12 +84,57 @@ def draw_scenes(number: int, sources: list[Path], views: int, out: Path) -> Path
     path = out / f"scenes-{number:06d}.npz"
     if path.exists():
         return path
-    things = [thing for source in sources for thing in pickle.loads(source.read_bytes())]
     try:
+        things = [thing for source in sources for thing in load_things(source)]
         draw_views(np.random.default_rng([number, 71]), things, views, SIZE, looks=LOOKS)[0].save(path)
     except Exception as error:  # costs these pictures alone
         return f"scenes {number}: {error!r}"
     return path
+
+
+def save_things(path: Path, things: list[LearntObject]) -> None:
+    """Write objects atomically. Their colours are told by seed and paint alone (`load_things`)."""
+    ends = np.cumsum([(len(t.vertices), len(t.faces)) for t in things], axis=0)
+    arrays: dict[str, Any] = {
+        name: np.array([getattr(t, name) for t in things]) for name in ("half_extent", "kind", "family", "seed")
+    }
+    arrays |= {
+        "vertices": np.concatenate([t.vertices for t in things]).astype(np.float32),
+        "faces": np.concatenate([t.faces for t in things]).astype(np.int32),
+        "description": np.stack([t.description for t in things]).astype(np.float16),
+        "paint": np.array([_paint(t) for t in things]),
+        "ends": ends,
+    }
+    with whole_file(path) as part, part.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+def load_things(path: Path) -> list[LearntObject]:
+    """The objects of a file."""
+    with np.load(path, allow_pickle=False) as file:
+        told = {name: file[name] for name in file.files}
+    vertices, faces = (np.split(told[name], told["ends"][:-1, k]) for k, name in enumerate(("vertices", "faces")))
+    things = []
+    for row, (family, seed, paint) in enumerate(zip(told["family"], told["seed"], told["paint"], strict=True)):
+        tabletop = family == TABLETOP
+        things.append(
+            LearntObject(
+                vertices=vertices[row],
+                faces=faces[row],
+                half_extent=float(told["half_extent"][row]),
+                colours=Coloured(sample_object(int(seed))) if tabletop else paint_of(int(seed), int(paint)).rgb,
+                description=told["description"][row],
+                kind=int(told["kind"][row]),
+                family=int(family),
+                seed=int(seed),
+            )
+        )
+    return things
+
+
+def _paint(thing: LearntObject) -> int:
+    """Which of its seed's paints a thing has; 0 for a tabletop object, which has its own."""
+    return 0 if thing.family == TABLETOP else thing.seed % PAINTS
 
 
 def _meshes(job: Job) -> tuple[ShapeSet, list[LearntObject]]:
@@ -101,7 +145,7 @@ def _meshes(job: Job) -> tuple[ShapeSet, list[LearntObject]]:
         except ValueError:  # a stretched or fallen variant may be no object
             continue
         thing, seed = placed(mesh[0], np.random.default_rng([mesh[1], 43])), mesh[1]
-        shapes, paint = sample_mesh(thing, seed), index % PAINTS
+        shapes, paint = sample_mesh(thing, seed), seed % PAINTS
         sets.append(shapes)
         things.append(
             LearntObject(

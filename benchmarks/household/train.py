@@ -22,12 +22,13 @@ import tyro
 
 from benchmarks.harness.machine import revision
 from benchmarks.harness.progress import say
+from benchmarks.household.latents import told_pictures
 from benchmarks.household.objects import BLOCK, EACH, SIZE, Job, Made, draw_scenes, make
 from foundation.worker_pool import worker_pool
 from perception.simulation.training_pictures import PicturePart
 from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.checkpoint import load_prior, save_posterior_network, save_prior, save_recognition
-from probnerf.prior.networks import PRESETS, ProbNeRF, Recognition
+from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.prior.posterior_flow import NetworkSizes, PosteriorNetwork
 from probnerf.rendering import foam
 from probnerf.training import elbo, posterior_flow
@@ -39,7 +40,6 @@ from probnerf.training.on_device import (
     train_pictures,
     train_solids,
 )
-from probnerf.training.picture_set import PictureSet
 from probnerf.training.settings import PosteriorTrainConfig, TrainConfig
 from probnerf.training.shape_set import ShapeSet, joined, load_shapes
 
@@ -323,28 +323,6 @@ def _blank_pictures(count: int, latent: int) -> DevicePictures:
         mean=zeros((count, latent)),
         sd=zeros((count, latent)),
         kind=zeros(count, jnp.uint8),
-    )
-
-
-def told_pictures(parts: list[PicturePart], recognition: Recognition, latent: int, chunk: int = 4096) -> PictureSet:
-    """The parts' pictures with the latents of their objects, which recognition tells many at a time."""
-    described = np.concatenate([part.description for part in parts])
-    every = eqx.filter_jit(eqx.filter_vmap(recognition))
-    mean, sd = np.zeros((len(described), latent), np.float32), np.zeros((len(described), latent), np.float32)
-    for start in range(0, len(described), chunk):
-        rows = np.arange(start, min(start + chunk, len(described)))
-        told, precision = every(jnp.asarray(described[np.resize(rows, chunk)], jnp.float32))
-        mean[rows], sd[rows] = np.asarray(told)[: len(rows)], np.asarray(1.0 / jnp.sqrt(precision))[: len(rows)]
-    offset = np.cumsum([0, *(len(part.description) for part in parts)])
-    row = np.concatenate([part.row + offset[k] for k, part in enumerate(parts)])
-    owner = np.concatenate([(part.family.astype(np.int64) << 40) + part.seed for part in parts])
-    names = ("rgb", "distance", "unknown", "T_view_camera", "tan_half_fov", "pose_sigma", "yaw", "pose")
-    return PictureSet(
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names},
-        mean=mean[row],
-        sd=sd[row],
-        object_id=owner[row],
-        kind=np.concatenate([part.kind for part in parts])[row],
     )
 
 

@@ -6,22 +6,16 @@ model costs one picture. The ray's end is drawn from the foam's distribution of 
 
 from dataclasses import dataclass
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from perception.simulation.plain_pictures import PlainDraws, TrainingPicture, draw_plain
 from perception.simulation.ray_caster import Hits
-from probnerf.fields.base import Field
 from probnerf.fields.mlp import MLPField
-from probnerf.likelihood.dispatch import density_at
-from probnerf.rendering import foam
-from probnerf.types import Rays
+from probnerf.ray_ends import colours_at, draw_ends
 
 HALF_EXTENT_M = (0.03, 0.2)  # log-uniform
 LEAST_PIXELS = 12  # of the shape, without which a picture says nothing
-_LATTICE = foam.Lattice(32, 1.1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,28 +29,15 @@ class ModelShape:
 
     def cast(self, origins: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]) -> Hits:
         """Draws of where these rays end. As a normal each has its direction, which colours are asked with."""
-        start = np.broadcast_to(origins, directions.shape)
-        rays = Rays(jnp.asarray(start, jnp.float32), jnp.asarray(directions, jnp.float32))
-        t, opacity, gap = (np.asarray(a) for a in _ends(self.field, self.weights, rays))
-        before = opacity > self.rng.random((len(directions), 1))
-        first, each = before.argmax(axis=1), np.arange(len(directions))
-        place = t[each, first] - self.rng.random(len(each)) * gap[each, first]
-        hit = before[:, -1]
-        return Hits(
-            distance=np.where(hit, place, np.inf),
-            mesh=np.where(hit, 0, -1),
-            face=np.where(hit, first, -1),
-            normal=np.asarray(directions),
-        )
+        distance, face = draw_ends(self.rng, self.field, self.weights, origins, directions)
+        mesh = np.where(face >= 0, 0, -1)
+        return Hits(distance=distance, mesh=mesh, face=face, normal=np.asarray(directions))
 
     def colours(
         self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
     ) -> Float[np.ndarray, "n 3"]:
         """The field's colours there."""
-        count = 1 << max(len(points) - 1, 1).bit_length()  # few compiled sizes
-        rows = np.resize(np.arange(len(points)), count)
-        seen = (jnp.asarray(a[rows], jnp.float32) for a in (points, directions))
-        return np.asarray(_colours(self.field, self.weights, *seen))[: len(points)]
+        return colours_at(self.field, self.weights, points, directions)
 
 
 def draw_shape(
@@ -67,17 +48,3 @@ def draw_shape(
     shape = ModelShape(field, weights, float(np.exp(rng.uniform(low, high))), rng)
     pictures = draw_plain(rng, shape, views, size, draws, shape)
     return [picture for picture in pictures if (picture.distance > 0).sum() >= LEAST_PIXELS]
-
-
-@jax.jit
-def _ends(field: Field, weights: Array, rays: Rays) -> tuple[Array, Array, Array]:
-    """Per face: distance, opacity up to it, gap before it."""
-    t = foam.crossings(rays, _LATTICE)
-    sigma = density_at(field, weights, None, foam.points_on_rays(rays, t))
-    faces = foam.composite(sigma, t, jnp.asarray(1.0 / _LATTICE.cubes))
-    return t, -jnp.expm1(faces.log_transmittance), foam.gap_before(t)
-
-
-@jax.jit
-def _colours(field: Field, weights: Array, points: Array, directions: Array) -> Array:
-    return field.colour(weights, points, directions, field.density(weights, points))
