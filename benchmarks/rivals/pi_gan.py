@@ -3,7 +3,8 @@
 z ~ N(0, I) goes through a mapping network to the frequencies and phases of a SIREN. There is no way from a picture to
 z, so it only samples. Smaller than the published one. Cameras are those of the data, which are known here, so the
 discriminator is told them (a projection discriminator, as EG3D's): without that, it would have to find the canonical
-pose by itself. It also sees how far the pictures of a batch differ (as progressive GANs' do). Pictures grow from 16 to 32 px; the field can be rendered at any size.
+pose by itself. It also sees how far the pictures of a batch differ, as progressive GANs' do. Pictures grow from 16 to
+32 px; the field can be rendered at any size.
 """
 
 import math
