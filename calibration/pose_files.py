@@ -66,9 +66,11 @@ def _rows(path: Path, text: str) -> list[tuple[str | None, Any]]:
     if not lines:
         return []
     mark = next((m for m in (",", ";", "\t") if m in lines[0]), None)
-    rows = (
-        [[c.strip() for c in row] for row in csv.reader(lines, delimiter=mark)] if mark else [x.split() for x in lines]
-    )
+    try:
+        cut = csv.reader(lines, delimiter=mark) if mark else (line.split() for line in lines)
+        rows = [[c.strip() for c in row] for row in cut]
+    except csv.Error as error:
+        raise ValueError(f"{path} is no table of poses ({error}); give {_FORMS}") from None
     names = [c.lower() for c in rows[0]]
     order, named = list(range(-7, 0)), len(rows[0]) == 8
     if not any(_is_number(c) for c in rows[0]):

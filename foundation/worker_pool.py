@@ -2,8 +2,9 @@
 
 import multiprocessing
 import os
+import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, wait
 from contextlib import contextmanager
 
 _ONE_THREAD = {  # of each process; and none of them takes an accelerator's memory
@@ -19,9 +20,11 @@ def worker_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
         before = {name: os.environ.get(name) for name in _ONE_THREAD}
         os.environ.update(_ONE_THREAD)
-        pool.submit(int).result()  # the first job starts all processes, with this environment
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
+        try:  # a process is started with each job that finds none idle: all of them now, with this environment
+            wait([pool.submit(time.sleep, 0.5) for _ in range(processes)])
+        finally:
+            for name, value in before.items():
+                os.environ.pop(name) if value is None else os.environ.update({name: value})
         try:
             yield pool
         except BaseException:

@@ -88,14 +88,14 @@ def _prior(path: Path) -> Prior:
 
 def draw_part(number: int, weights: Path, work: Path) -> Path:
     """A file of plain pictures of the model's own shapes, with their z as `mean`."""
-    path = work / f"model_{number:05d}.npz"
+    prior, rng = _prior(weights), np.random.default_rng([number, 99])
+    path = work / f"model_{prior.hash[:8]}_{number:05d}.npz"
     if path.exists():
         return path
-    prior, rng = _prior(weights), np.random.default_rng([number, 99])
     recognition = load_recognition(recognition_path(weights), prior)
     sources = sorted(work.glob("*.shapes"))
-    pictures, latents, kinds = [], [], []
-    for _ in range(SHAPES):
+    pictures, latents, kinds, owner = [], [], [], []
+    for shape in range(SHAPES):
         z, kind = np.asarray(_forward(prior.model.flow, on_device(rng.standard_normal(prior.model.latent)))), UNTOLD
         if sources and rng.random() >= OWN:
             shapes = _shapes(sources[int(rng.integers(len(sources)))])
@@ -108,6 +108,7 @@ def draw_part(number: int, weights: Path, work: Path) -> Path:
         pictures += drawn
         latents += [z] * len(drawn)
         kinds += [kind] * len(drawn)
+        owner += [-1 - number * SHAPES - shape] * len(drawn)
     arrays: dict[str, Any] = {
         name: np.stack([np.asarray(getattr(picture, name)) for picture in pictures]).astype(kind)
         for name, kind in _TYPES.items()
@@ -115,7 +116,13 @@ def draw_part(number: int, weights: Path, work: Path) -> Path:
     }
     arrays["rgb"] = np.stack([np.round(255.0 * picture.rgb) for picture in pictures]).astype(np.uint8)
     with whole_file(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, **arrays, mean=np.stack(latents).astype(np.float32), kind=np.array(kinds, np.uint8))
+        np.savez_compressed(
+            file,
+            **arrays,
+            mean=np.stack(latents).astype(np.float32),
+            kind=np.array(kinds, np.uint8),
+            object_id=np.array(owner),
+        )
     return path
 
 
@@ -158,7 +165,7 @@ def gathered(prior: Prior, weights: Path, work: Path, model_parts: Sequence[Path
         with np.load(path) as file:
             for name in file.files:
                 own[name] = np.concatenate([own[name], file[name]]) if name in own else file[name]
-    own |= {"sd": np.zeros_like(own["mean"]), "object_id": -1 - np.arange(len(own["mean"])) // VIEWS}
+    own["sd"] = np.zeros_like(own["mean"])
     names = [f.name for f in fields(PictureSet)]
     every = PictureSet(**{name: np.concatenate([getattr(real, name), own[name]]) for name in names})
     sort = np.full(len(every), 2)
@@ -215,6 +222,10 @@ def main(options: Options) -> None:
     prior, recipe, out = load_prior(options.prior), options.recipe, options.out
     out.mkdir(parents=True, exist_ok=True)
     options.work.mkdir(parents=True, exist_ok=True)
+    if not any(options.work.glob("*.plain")):
+        raise ValueError(
+            f"{options.work} has no pictures of objects (*.plain); `benchmarks.household.objects.make` draws them"
+        )
     count = -(-options.draws // (SHAPES * VIEWS))
     with worker_pool(options.processes) as pool:
         jobs = [pool.submit(draw_part, n, options.prior, options.work) for n in range(count)]

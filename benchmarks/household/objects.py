@@ -1,9 +1,10 @@
-"""Objects and pictures that the shipped prior and its network learn from, in small jobs for many processes.
+"""Objects and pictures that a household prior and its network learn from, in small jobs for many processes.
 
 A job's work depends on its numbers alone. Four families: tabletop objects, the household generator's things, the
 variants of a folder's meshes, and those of a folder of Infinigen's objects (`probnerf.training.infinigen`).
 """
 
+import zlib
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -41,7 +42,8 @@ class Job:
     @property
     def name(self) -> str:
         """Of its files."""
-        return f"{self.family}-{self.first:06d}"
+        where = "" if self.folder is None else f"-{zlib.crc32(str(self.folder.resolve()).encode()):08x}"
+        return f"{self.family}{where}-{self.first:06d}"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Make the shipped prior and its network on one accelerator, by the clock: `python -m benchmarks.household.train`.
+"""Make a household prior and its network on one accelerator, by the clock: `python -m benchmarks.household.train`.
 
 Three stages overlap. All processes make objects, their shapes and plain pictures. Then the prior learns the shapes,
 while the processes draw scenes as perception sees them. Then the network learns the pictures. Each stage ends at its

@@ -85,13 +85,16 @@ def main(options: Options) -> Path:
         "recipe": asdict(options.recipe),
         "revision": revision(),
     }
-    if options.on_device:
-        state = _solid_phase(model, solids, likelihood, options.recipe, out)
+
+    def save(state: elbo.TrainState) -> None:
         save_prior(weights, state.model, story | {"steps": int(state.step)}, half=True)
         save_recognition(recognition_path(weights), state.recognition, load_prior(weights).hash)
+
+    if options.on_device and options.recipe.solid_steps:
+        save(_solid_phase(model, solids, likelihood, options.recipe, out))
     for state, metrics in elbo.train(model, [(solids, 1.0)], views, likelihood, options.recipe, out):
         say("  ".join(f"{name} {value:.5g}" for name, value in metrics.items()))
-        save_prior(weights, state.model, story | {"steps": int(state.step)}, half=True)
+        save(state)
     return weights
 
 
@@ -110,7 +113,10 @@ def _solid_phase(
         state, parts = train_solids((likelihood, config, shapes, count), state)
         if step % (10 * count) == 0:
             metrics = {"step": step + count, "rays": False, **{k: float(v[-1]) for k, v in parts.items()}}
+            if not np.isfinite(metrics["loss"]):
+                raise FloatingPointError(f"loss is {metrics['loss']} at step {step + count}")
             run.record(metrics)
+            run.save(state)
             say("  ".join(f"{name} {value:.5g}" for name, value in metrics.items()))
     run.save(state)
     return state

@@ -88,9 +88,11 @@ def rendered(
 ) -> Float[Array, "v s s 3"]:
     """Pictures of a field, some rays at a time (`integrate`)."""
     origin, direction = jax.vmap(lambda T: picture_rays(T, tan_half_fov, size))(T_object_camera)
-    rays = jnp.stack([origin, direction], axis=2).reshape(-1, min(size * size, RAYS), 2, 3)
-    rgb = jax.lax.map(lambda part: integrate(field, box, part[:, 0], part[:, 1], samples)[0], rays)
-    return rgb.reshape(-1, size, size, 3)
+    rays = jnp.stack([origin, direction], axis=2).reshape(-1, 2, 3)
+    each = min(size * size, RAYS)
+    padded = jnp.concatenate([rays, rays[: -len(rays) % each]]).reshape(-1, each, 2, 3)
+    rgb = jax.lax.map(lambda part: integrate(field, box, part[:, 0], part[:, 1], samples)[0], padded)
+    return rgb.reshape(-1, 3)[: len(rays)].reshape(-1, size, size, 3)
 
 
 def save_rival(path: Path, name: str, model: Any, metadata: dict[str, Any]) -> None:

@@ -5,10 +5,8 @@ Objects and cameras depend on the seed alone, so each split is the same whoever 
 
 import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal
 
@@ -18,14 +16,10 @@ import tyro
 from benchmarks.harness.progress import say
 from benchmarks.paper.families import FAMILIES, SPLITS, TAN_HALF_FOV, view_set
 from benchmarks.rivals.picture_set import PictureSet
+from foundation.worker_pool import worker_pool
 from probnerf.training.pictures import ViewSet
 
 PART = 10  # objects, of one job
-ONE_THREAD = {  # of each process; and none of them takes an accelerator's memory
-    "JAX_PLATFORMS": "cpu",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-}
 
 
 @dataclass(frozen=True)
@@ -57,9 +51,8 @@ def draw_pictures(options: Options) -> PictureSet:
     """All pictures, objects in the order of their seeds."""
     seeds = SPLITS[options.split][: options.count]
     parts = [seeds[start : start + PART] for start in range(0, len(seeds), PART)]
-    os.environ.update(ONE_THREAD)  # the processes inherit it
     drawn = []
-    with ProcessPoolExecutor(options.processes, get_context("spawn")) as pool:
+    with worker_pool(options.processes) as pool:
         for views in pool.map(partial(draw, options.family, options.views, options.size), parts):
             drawn.append(views)
             if len(drawn) % 10 == 0 or len(drawn) == len(parts):

@@ -179,7 +179,10 @@ def main(options: Options) -> Path:
         raise ValueError(f"there is no rival '{options.model}'; choose one of {', '.join(RIVALS)}")
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # others train beside it
     run, entry = Run(options), RIVALS[options.model]
-    learnt, new = split(load_pictures(options.data))
+    given = load_pictures(options.data)
+    if given.rgb.shape[1] < 3:
+        raise ValueError(f"{options.data} has {given.rgb.shape[1]} views of each object; 3 or more are examined")
+    learnt, new = split(given)
     pictures, box = on_device(learnt)
     config = entry.config(box=box, tan_half_fov=float(learnt.tan_half_fov), **(entry.tiny if options.tiny else {}))
     recipe = entry.recipe(config)

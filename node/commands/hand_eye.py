@@ -69,7 +69,17 @@ def _posed(
 ) -> list[PosedView]:
     """The views that have a pose: by the picture's name where one is named in the file, else by their order."""
     known = {name: name for name in names} | {Path(name).stem: name for name in names}
-    by_name = {known[Path(p.picture).name]: p for p in poses if p.picture and Path(p.picture).name in known}
+    by_name = dict[str, RobotPose]()
+    for pose in poses:
+        path = Path(pose.picture or "")
+        for name in (path.name, path.stem):
+            if name in known:
+                by_name.setdefault(known[name], pose)
+    words = [p.picture for p in poses if p.picture and not p.picture.replace(".", "").isdigit()]
+    if words and not by_name:
+        raise ValueError(
+            f"{options.poses} names {words[0]}, and no such name is among the pictures of {options.source}; name those"
+        )
     if not by_name:  # not named, or with stamps
         if len(poses) != len(names):
             raise ValueError(

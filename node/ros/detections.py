@@ -1,5 +1,6 @@
 """Boxes of another node's detector (vision_msgs/Detection2DArray) for the picture that they are of."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ DETECTIONS_IN = "vision_msgs/msg/Detection2DArray"
 BoxPx = tuple[int, int, int, int]
 _MARGIN, _LEAST_MARGIN = 0.08, 4.0  # of the box's side, and px: a detector's boxes are tight, and cut a rim off
 _MOST = 64
+_SAME = 0.3  # intersection over union with a box of the last picture from which it is the same thing's
 
 
 def boxes_of(message: Any, frame_id: str, size: tuple[int, int], least_score: float) -> list[BoxPx]:
@@ -39,3 +41,24 @@ def boxes_of(message: Any, frame_id: str, size: tuple[int, int], least_score: fl
         if x0 < x1 and y0 < y1:
             boxes.append((x0, y0, x1, y1))
     return boxes
+
+
+def kept_ids(boxes: Sequence[BoxPx], last: Mapping[int, BoxPx]) -> list[int]:
+    """An id for each box: that of the box of the last picture which it overlaps most, or a number that none has.
+
+    Scores change from picture to picture, so their order does not name the things in the boxes.
+    """
+    pairs = sorted(((-_iou(box, old), k, name) for k, box in enumerate(boxes) for name, old in last.items()))
+    ids: dict[int, int] = {}
+    for apart, k, name in pairs:
+        if -apart > _SAME and k not in ids and name not in ids.values():
+            ids[k] = name
+    free = (number for number in range(1, 2 * _MOST + 1) if number not in {*last, *ids.values()})
+    return [ids[k] if k in ids else next(free) for k in range(len(boxes))]
+
+
+def _iou(a: BoxPx, b: BoxPx) -> float:
+    width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
+    both = max(width, 0) * max(height, 0)
+    areas = [(box[2] - box[0]) * (box[3] - box[1]) for box in (a, b)]
+    return both / (sum(areas) - both)

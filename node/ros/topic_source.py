@@ -8,8 +8,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from node.ros.bus import Bus
-from node.ros.detections import DETECTIONS_IN, BoxPx, boxes_of
+from node.ros.detections import DETECTIONS_IN, BoxPx, boxes_of, kept_ids
 from node.ros.settings import TopicConfig
 from perception.observation.segmentation import label_boxes
 from perception.observation.settings import SegmentConfig
@@ -48,6 +50,7 @@ class TopicSource:
         self._matched: tuple[Any, dict[str, Any]] | None = None  # the newest colour, and its depth and detections
         self._info: Any = None
         self._by_arrival = False  # some stream has no stamps
+        self._boxes: dict[int, BoxPx] = {}  # of the last detections, by id
         self._heard: set[str] = set()  # topics on which something came since the last frame
         self._newest: tuple[Frame, list[BoxPx] | None] | None = None
         self._closed = False
@@ -96,7 +99,7 @@ class TopicSource:
             heard = self._heard | ({self.config.info} if self._info is not None else set())
             wanted = (self.config.info, self.config.colour, *filter(None, [self.config.depth, self.config.detections]))
             missing = [name for name, topic in zip(self._names, wanted, strict=True) if topic not in heard]
-        why = f"nothing came on {', '.join(missing)}" if missing else "no colour image found its depth"
+        why = f"nothing came on {', '.join(missing)}" if missing else "no colour image found its depth or detections"
         return f"no frame for {seconds:.1f} s: {why}; is the driver up, on this domain and with these topic names?"
 
     def _take_info(self, info: Any) -> None:
@@ -142,7 +145,13 @@ class TopicSource:
             return None
         for reason in why:
             self._note("a detection", f"a detection is left out: {reason}")
-        return replace(frame, label=label)
+        ids = kept_ids(boxes, self._boxes)
+        self._boxes = dict(zip(ids, boxes, strict=True))
+        if not label.any():  # an empty table; silence would say that the camera is down
+            self.skipped += 1
+            self._note("no detection", "a frame without a detection is passed over")
+            return None
+        return replace(frame, label=np.array([0, *ids], np.int32)[label])
 
     def _settle(self, matches: list[Match[Any, Any]]) -> None:
         """Keep the newest pair, and count dropped pairs. The caller holds the lock."""
