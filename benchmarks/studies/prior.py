@@ -31,7 +31,7 @@ from benchmarks.harness.study import Summary, TableOptions
 from benchmarks.harness.tables import Table, between, verdict
 from benchmarks.measures.rebuilt import GRID, VIEWS, GateConfig, Rebuilt, rebuild_all, render_pixels
 from probnerf.objects.tabletop import TEST_SEEDS
-from probnerf.prior.checkpoint import Prior, load_prior, load_recognition, recognition_path
+from probnerf.prior.checkpoint import SHIPPED, Prior, load_prior, load_recognition, recognition_path
 from probnerf.prior.networks import ProbNeRF, Recognition
 from probnerf.settings import AdamConfig
 
@@ -90,8 +90,8 @@ def main(options: Options) -> Summary:
     rows.append(Row("prior", "map", f"{VIEWS} views", "passed", float(found["passed"]), "", len(rebuilt)))
     if options.household:
         count = min(options.household, 5) if options.quick else options.household
-        beside = None if options.prior is None else recognition_path(options.prior)
-        recognition = load_recognition(beside, prior) if beside is not None and beside.is_file() else None
+        beside = recognition_path(options.prior or SHIPPED)
+        recognition = load_recognition(beside, prior) if beside.is_file() else None
         more, table = _household(prior, recognition, count)
         rows += more
         tables.append(table)
