@@ -47,14 +47,9 @@ class Incoming:
         """In zenoh's own thread: the sender's, which waits for it, so that a flood stays where it comes from."""
         sequence, sender = _tag_or_none(item)
         with self._lock:
-            if sender not in self._known:
-                if not self._newcomers.allows():
-                    return self._turn_away(item)
-                if len(self._known) >= _SENDERS:
-                    self._known.popitem(last=False)
-                self._known[sender] = _Sender(Rate(self._config.max_rate))
-            self._known.move_to_end(sender)
-            lost = self._known[sender].lost(sequence)
+            lost = self._lost(sender, sequence)
+        if lost is None:  # outside the lock: what is said may wait for a slow terminal
+            return self._turn_away(item)
         dropped = self._waiting.put(sender, item, _size(item))
         if self._refuse:
             for query in dropped:
@@ -62,6 +57,21 @@ class Incoming:
         if lost + len(dropped):
             flood = f"requests of one client come faster than they are answered; its newest {self._depth} wait"
             self._counts.add(self._name, "dropped", flood if self._refuse and dropped else "", lost + len(dropped))
+
+    def _lost(self, sender: bytes, sequence: int) -> int | None:
+        """How many messages of the sender were lost before this one; None for a newcomer in a crowd of them.
+
+        The first ones of a topic are no crowd: at a start all are new, and a latched message comes once. The caller
+        holds the lock.
+        """
+        if sender not in self._known:
+            if len(self._known) >= _NEWCOMERS and not self._newcomers.allows():
+                return None
+            if len(self._known) >= _SENDERS:
+                self._known.popitem(last=False)
+            self._known[sender] = _Sender(Rate(self._config.max_rate))
+        self._known.move_to_end(sender)
+        return self._known[sender].lost(sequence)
 
     def _turn_away(self, item: Any) -> None:
         if self._refuse:
