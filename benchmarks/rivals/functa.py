@@ -147,7 +147,7 @@ class Functa(eqx.Module):
         """
         config, size = self.config, len(picture)
         origin, direction = picture_rays(T_object_camera, config.tan_half_fov, size)
-        truth = picture.reshape(-1, 3) / 255.0
+        truth = jnp.asarray(picture).reshape(-1, 3) / 255.0
 
         def loss(normal, key):
             k0, k1 = jax.random.split(key)
