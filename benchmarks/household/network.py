@@ -143,6 +143,12 @@ _squares = eqx.filter_jit(lambda flow, z: jax.vmap(lambda one: jnp.sum(flow.inve
 _decoded = eqx.filter_jit(lambda hyper, z: hyper(z))
 
 
+def _untold(flow: RealNVP, mean: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """-log N(z~; 0, I) of a draw of each z, nats."""
+    z = mean + sd * np.random.default_rng(0).standard_normal(mean.shape)
+    return 0.5 * np.asarray(_squares(flow, on_device(z))) + 0.5 * mean.shape[1] * np.log(2.0 * np.pi)
+
+
 @dataclass(frozen=True)
 class Material:
     """All pictures, and which rows are of which sort."""
@@ -160,11 +166,8 @@ def gathered(prior: Prior, weights: Path, work: Path, model_parts: Sequence[Path
         for sort, pattern in (("objects", "*.plain"), ("scenes", "scenes-*.npz"))
     }
     real = told_pictures([part for each in parts.values() for part in each], recognition, prior.model.latent)
-    own: dict[str, np.ndarray] = {}
-    for path in model_parts:
-        with np.load(path) as file:
-            for name in file.files:
-                own[name] = np.concatenate([own[name], file[name]]) if name in own else file[name]
+    drawn = [dict(np.load(path)) for path in model_parts]
+    own = {name: np.concatenate([part.pop(name) for part in drawn]) for name in tuple(drawn[0])}
     own["sd"] = np.zeros_like(own["mean"])
     names = [f.name for f in fields(PictureSet)]
     every = PictureSet(**{name: np.concatenate([getattr(real, name), own[name]]) for name in names})
@@ -208,12 +211,13 @@ def rate_at(share: float, recipe: PosteriorTrainConfig) -> float:
 def judged(
     network: PosteriorNetwork, material: Material, flow: RealNVP, recipe: PosteriorTrainConfig
 ) -> dict[str, dict[str, float]]:
-    """The parts of the loss on held-out pictures of each sort, nats."""
-    found = {}
+    """The parts of the loss on held-out pictures of each sort, nats; `untold` is N(0, I)'s, which looks at nothing."""
+    found, pictures = {}, material.pictures
     for name, rows in material.held_out.items():
         if len(rows) >= recipe.batch:
-            parts = posterior_flow.validate(network, material.pictures, rows, recipe, flow)
+            parts = posterior_flow.validate(network, pictures, rows, recipe, flow)
             found[name] = {key.removeprefix("validation_"): round(value, 2) for key, value in parts.items()}
+            found[name]["untold"] = round(float(np.mean(_untold(flow, pictures.mean[rows], pictures.sd[rows]))), 2)
     return found
 
 
