@@ -98,6 +98,11 @@ def _object_points(
     with np.errstate(invalid="ignore"):
         core |= mask & (np.linalg.norm(points - points[row, column], axis=-1) < rim_reach)
     core &= heights(points, segment.plane) > 0.0
+    if core.sum() < 10:  # a flat thing, where the plane is measured some millimetres too high
+        raise ValueError(
+            f"object {segment.id} has {core.sum()} measured points above the plane that it stands on; give the plane,"
+            " or another object"
+        )
     thin = max(1, core.sum() // 10_000)
     return points[core][::thin], hidden[box][core][::thin]
 

@@ -220,6 +220,15 @@ def test_too_little_depth_is_named() -> None:
         observe(blank, found, CONFIG)
 
 
+def test_a_thing_that_lies_below_its_plane_is_named() -> None:
+    """As of a flat thing whose plane is measured too high (`sensor_draws.mistaken_plane`)."""
+    frame = picture(CAN)
+    (found,) = segment(frame, 1)
+    sunk = replace(found, plane=found.plane - [0.0, 0.0, 0.0, CAN.height + 0.05])
+    with pytest.raises(ValueError, match="object 1 has 0 measured points above the plane"):
+        object_frame(frame, sunk, CONFIG)
+
+
 def centres(cube: ObjectFrame, T: np.ndarray, grid: int = 64) -> np.ndarray:
     ticks = -1 + (np.arange(grid) + 0.5) * 2 / grid
     return to_world(cube.to_camera(np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1)), T)
