@@ -14,7 +14,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     After an error `path` is as it was before, and nothing else is left. Makes the folder where there is none.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part = path.with_name(f".{path.name}.{os.uname().nodename}.{os.getpid()}.part")  # a folder may be of many machines
     try:
         yield part
         part.replace(path)

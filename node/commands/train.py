@@ -5,7 +5,7 @@ import os
 import subprocess
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,6 +33,7 @@ from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering import foam
 from probnerf.training import elbo as training
 from probnerf.training.pictures import ViewSet, draw_views
+from probnerf.training.processes import Mesh, is_first, joined
 from probnerf.training.shape_set import ShapeSet, load_shapes
 from probnerf.training.srn_dataset import read_views
 from probnerf.training.tabletop_shapes import tabletop_shapes
@@ -44,8 +45,20 @@ TABLETOP_SHARE = 0.4  # of a batch, where there are other things; these share th
 def train(options: Training, out: Console, err: Console) -> bool:
     """Train, or continue an earlier run of the same recipe in `options.out`. False after Ctrl-C.
 
-    Raises ValueError if the folder holds another recipe, FloatingPointError if the loss is not finite.
+    Raises ValueError if the folder holds another recipe, FloatingPointError if the loss is not finite, ConnectionError
+    if one of several processes is lost.
     """
+    where, processes, process = options.coordinator, options.processes, options.process
+    try:
+        with nullcontext() if where is None else joined(where, processes, process) as mesh:
+            _train(options, mesh, out, err)
+    except KeyboardInterrupt:
+        out.print("stopped; the same command continues from the last checkpoint", highlight=False)
+        return False
+    return True
+
+
+def _train(options: Training, mesh: Mesh | None, out: Console, err: Console) -> None:
     preset, config, folder = PRESETS[options.preset], options.recipe, options.out
     check_folder(folder)
     if options.data is not None:  # there is no phase that trains only the decoder
@@ -66,22 +79,22 @@ def train(options: Training, out: Console, err: Console) -> bool:
     likelihood = Likelihood(lattice=foam.Lattice(preset.lattice, 1.0, 9 * preset.lattice // 4))
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     state = None
-    try:
-        with (
-            Progress(*columns, TimeRemainingColumn(), console=err, disable=not err.is_terminal) as progress,
-            drawn_curves(folder, out),
+    with (
+        Progress(*columns, TimeRemainingColumn(), console=err, disable=not err.is_terminal) as progress,
+        drawn_curves(folder, out),
+    ):
+        solids, views, story = _material(options, preset.image_size, progress)
+        steps = progress.add_task("steps", total=config.steps)
+        for state, metrics in training.train(  # noqa: B007
+            model, solids, views, likelihood, config, folder, recognition, mesh
         ):
-            solids, views, story = _material(options, preset.image_size, progress)
-            steps = progress.add_task("steps", total=config.steps)
-            for state, metrics in training.train(model, solids, views, likelihood, config, folder, recognition):  # noqa: B007
-                text = "steps  " + "  ".join(f"{k} {v:.4g}" for k, v in metrics.items() if k != "step")
-                progress.update(steps, completed=int(metrics["step"]), description=text)
-    except KeyboardInterrupt:
-        out.print("stopped; the same command continues from the last checkpoint", highlight=False)
-        return False
+            text = "steps  " + "  ".join(f"{k} {v:.4g}" for k, v in metrics.items() if k != "step")
+            progress.update(steps, completed=int(metrics["step"]), description=text)
+    if not is_first():
+        return
     if state is None:
         out.print(f"{folder} is trained already", highlight=False, soft_wrap=True)
-        return True
+        return
     story |= {
         "recipe": asdict(config),
         "steps": int(state.step),
@@ -96,7 +109,6 @@ def train(options: Training, out: Console, err: Console) -> bool:
         learnt["meshes"] = [os.path.relpath(meshes, folder) for meshes in options.meshes]
         write_whole(folder / LEARNT, json.dumps(learnt, indent=1).encode())
     out.print(f"{weights}; judge it with `farside bench prior --prior {weights}`", highlight=False, soft_wrap=True)
-    return True
 
 
 @contextmanager
@@ -106,7 +118,7 @@ def drawn_curves(folder: Path, out: Console) -> Iterator[None]:
         yield
     finally:
         history, curves = folder / "history.jsonl", folder / "curves.png"
-        if history.is_file() and (lines := history.read_text(encoding="utf-8").splitlines()):
+        if is_first() and history.is_file() and (lines := history.read_text(encoding="utf-8").splitlines()):
             draw_training(curves, [json.loads(line) for line in lines])
             out.print(str(curves), highlight=False, soft_wrap=True)
 

@@ -1,10 +1,12 @@
 """Options of the commands that train (as `options`: only modules without JAX are imported here)."""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
+from tyro.conf import arg
 
 from probnerf.training.settings import PosteriorTrainConfig, TrainConfig
 
@@ -39,7 +41,23 @@ class Training:
     --pictured are not read."""
     pictures: int | None = None
     """Pictures of each of them; 8 by default, or all with --data."""
+    coordinator: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="(default: one process)")] = None
+    """Train in several processes, on one machine or many: where process 0 is, with any free port. Under Slurm or Open
+    MPI `auto`, without the next two. --batch and --ray-batch are of all processes together."""
+    processes: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """How many processes; each is started with the same options, but for --process."""
+    process: Annotated[int | None, arg(metavar="I", help_behavior_hint="")] = None
+    """Which of them this is, from 0 to N - 1. Process 0 reads and writes checkpoint, history and weights in --out."""
     recipe: tyro.conf.OmitArgPrefixes[TrainConfig] = field(default_factory=TrainConfig)
+
+    def __post_init__(self) -> None:
+        told = self.coordinator not in (None, "auto")
+        if {told} != {self.processes is not None, self.process is not None}:
+            raise ValueError("several processes need --coordinator HOST:PORT, --processes and --process; or auto alone")
+        if told and not re.fullmatch(r".+:\d+", str(self.coordinator)):
+            raise ValueError(f"--coordinator is {self.coordinator}; give HOST:PORT of process 0, or auto")
+        if self.processes is not None and self.process is not None and not 0 <= self.process < self.processes:
+            raise ValueError(f"--process is {self.process} of {self.processes}; give 0 to {self.processes - 1}")
 
 
 @dataclass(frozen=True)

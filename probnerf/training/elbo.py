@@ -16,6 +16,7 @@ and q(z) comes from the picture encoder.
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.sharding import Mesh
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from probnerf.likelihood.dispatch import map_with_gradient, weighted_terms
@@ -34,6 +36,7 @@ from probnerf.prior.networks import ProbNeRF, Recognition
 from probnerf.rendering import foam
 from probnerf.training.batches import Batch, draw_batch, strata_of
 from probnerf.training.pictures import ViewSet
+from probnerf.training.processes import everywhere, is_first, share_by_share, shares
 from probnerf.training.run_folder import RunFolder
 from probnerf.training.settings import TrainConfig
 from probnerf.training.shape_set import DESCRIPTION, ShapeBatch, ShapeSet, batch_of, draw_shapes
@@ -153,11 +156,12 @@ def loss(
     kl_weight: Array,
     likelihood: Likelihood,
     config: TrainConfig,
+    mesh: Mesh | None = None,
 ) -> tuple[Array, dict[str, Array]]:
     """Negative ELBO per object, with q(z) from recognition, and its parts.
 
     With `batch`, it includes rays and the encoder's loss. Without `solids`, q(z) comes from the encoder, and only rays
-    are used.
+    are used. `mesh` holds the processes' devices that share the objects.
     """
     model, recognition = networks
     k0, k1 = jax.random.split(key)
@@ -179,7 +183,8 @@ def loss(
         terms, each = _ray_terms, (_ObjectRays(*map(jnp.asarray, drawn)), each)
         encoder = encoder_loss(model, batch, z) if solids is not None else encoder
     bound = _Bound(terms, (model.field, likelihood, config))
-    fit = jnp.mean(map_with_gradient(bound, config.map_batch, None, each, weights))
+    mapped = share_by_share(partial(map_with_gradient, bound, config.map_batch, None), mesh)
+    fit = jnp.mean(mapped(each, weights))
     return kl_weight * kl - fit + encoder, {"fit": fit, "kl": kl, "encoder": encoder}
 
 
@@ -250,14 +255,18 @@ def initial_state(model: ProbNeRF, config: TrainConfig, recognition: Recognition
 
 
 def updated(
-    static: tuple[Likelihood, TrainConfig], state: TrainState, solids: ShapeBatch | None, batch: Batch | None
+    static: tuple[Likelihood, TrainConfig],
+    state: TrainState,
+    solids: ShapeBatch | None,
+    batch: Batch | None,
+    mesh: Mesh | None = None,
 ) -> tuple[TrainState, dict[str, Array]]:
-    """One update. Without `batch`, it is a step of the solid phase."""
+    """One update. Without `batch`, it is a step of the solid phase. `mesh`: as in `loss`."""
     likelihood, config = static
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
     kl_weight = jnp.clip(state.step / config.kl_warmup, 0.02, 1.0)
     (value, parts), gradient = jax.value_and_grad(loss, has_aux=True)(
-        (state.model, state.recognition), solids, batch, key, kl_weight, likelihood, config
+        (state.model, state.recognition), solids, batch, key, kl_weight, likelihood, config, mesh
     )
     update, optimiser = optimiser_of(config).update(gradient, state.optimiser)
     model, recognition = optax.apply_updates((state.model, state.recognition), update)
@@ -275,12 +284,14 @@ def train(
     config: TrainConfig,
     folder: Path,
     recognition: Recognition | None = None,
+    mesh: Mesh | None = None,
 ) -> Iterator[tuple[TrainState, dict[str, float]]]:
     """Run or resume in `folder`; yields (state, metrics) every `log_every` steps and appends them to history.jsonl.
 
     `solids` are sets of shapes and their shares of each batch; `views` are pictures of the first set's first objects.
     Without solids, there is no solid phase, and training uses only pictures. Raises FloatingPointError with the step if
-    the loss is not finite. The last checkpoint is kept.
+    the loss is not finite. The last checkpoint is kept. With a `mesh` (`processes.joined`), all processes call this
+    alike, and the first one reads and writes the folder.
     """
     if not solids and config.solid_steps:
         raise ValueError(f"solid_steps is {config.solid_steps}; it must be 0 where there are pictures alone")
@@ -288,7 +299,8 @@ def train(
         raise ValueError(f"--views is {config.views} but objects have {views.rgb.shape[1]} pictures; give no more")
     run = RunFolder(folder, config)
     # a copy, because a step donates its input buffers
-    state = run.resume(initial_state(jax.tree.map(jnp.copy, model), config, jax.tree.map(jnp.copy, recognition)))
+    state = initial_state(jax.tree.map(jnp.copy, model), config, jax.tree.map(jnp.copy, recognition))
+    state = everywhere(run.resume(state) if is_first() else state, mesh)
     strata = strata_of(views)
     start = int(state.step)
 
@@ -306,7 +318,7 @@ def train(
         for step in range(start, config.steps):
             data = coming.result()
             coming = drawer.submit(data_of, step + 1)
-            state, parts = train_step((likelihood, config), state, *data)
+            state, parts = train_step((likelihood, config), state, *shares(data, mesh), mesh)
             done = step + 1
             if done % config.log_every == 0 or done == config.steps:
                 metrics = {k: float(v) for k, v in parts.items()}
@@ -314,7 +326,8 @@ def train(
                     raise FloatingPointError(
                         f"loss is {metrics['loss']} at step {done}; {run.checkpoint} holds an earlier step"
                     )
-                run.record({"step": done, "rays": step >= config.solid_steps, **metrics})
-                if done % config.checkpoint_every == 0 or done == config.steps:
-                    run.save(state)
+                if is_first():
+                    run.record({"step": done, "rays": step >= config.solid_steps, **metrics})
+                    if done % config.checkpoint_every == 0 or done == config.steps:
+                        run.save(state)
                 yield state, {"step": done, **metrics}

@@ -45,6 +45,7 @@ class Trainer:
         config: TrainConfig,
         folder: Path,
         recognition: Any = None,
+        mesh: Any = None,
     ) -> Iterator:
         self.asked = {"model": model, "solids": solids, "views": views, "config": config, "likelihood": likelihood}
         self.asked["recognition"] = recognition
