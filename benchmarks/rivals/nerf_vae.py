@@ -17,19 +17,15 @@ from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 from benchmarks.rivals.layers import ConditionedBlock, Dense, descent, encoded
 from benchmarks.rivals.model import rendered
 from benchmarks.rivals.recipe import Metrics, Phase, Recipe, descend, optimiser, rate
-from benchmarks.rivals.volume import Box, Pictures, directions, draw_rays, integrate
+from benchmarks.rivals.volume import FieldConfig, Pictures, directions, draw_rays, integrate
 
 MOST_GIVEN = 4  # pictures
 
 
 @dataclass(frozen=True)
-class NeRFVAEConfig:
+class NeRFVAEConfig(FieldConfig):
     """Sizes of the networks, and how they are trained."""
 
-    box: Box
-    """Outside is nothing."""
-    tan_half_fov: float
-    """Of all cameras."""
     size: int = 64
     """px a side of the pictures that the encoder sees."""
     latent: int = 64
@@ -37,24 +33,10 @@ class NeRFVAEConfig:
     """Of the encoder, from half the picture's size on."""
     summary: int = 256
     """Features of a picture."""
-    width: int = 192
-    blocks: int = 4
-    octaves: int = 6
-    """Of the points' encoding."""
-    samples: int = 48
-    """On a ray."""
-    density_scale: float = 30.0
-    """Per cube unit."""
     noise: float = 0.1
     """Standard deviation of a pixel's colour."""
     warm_up: float = 0.25
     """Share of the training in which the KL's factor rises to 1."""
-    objects: int = 24
-    """A step."""
-    rays: int = 128
-    """An object and step."""
-    peak_rate: float = 1e-3
-    """Of Adam."""
 
 
 class Encoder(eqx.Module):

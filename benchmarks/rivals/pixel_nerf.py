@@ -17,35 +17,17 @@ from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 from benchmarks.rivals.layers import ConditionedBlock, ConvolutionBlock, Dense, descent, doubled, encoded
 from benchmarks.rivals.model import rendered
 from benchmarks.rivals.recipe import Metrics, Phase, Recipe, descend, optimiser, rate
-from benchmarks.rivals.volume import Box, Pictures, draw_rays, integrate, projected
+from benchmarks.rivals.volume import FieldConfig, Pictures, draw_rays, integrate, projected
 
 
 @dataclass(frozen=True)
-class PixelNeRFConfig:
+class PixelNeRFConfig(FieldConfig):
     """Sizes of the networks, and how they are trained."""
 
-    box: Box
-    """Outside is nothing."""
-    tan_half_fov: float
-    """Of all cameras."""
     channels: tuple[int, ...] = (32, 64, 96, 128, 160)
     """Of the U-net on its way down, from the whole picture on."""
     features: int = 96
     """Of a pixel."""
-    width: int = 192
-    blocks: int = 4
-    octaves: int = 6
-    """Of the points' encoding."""
-    samples: int = 48
-    """On a ray."""
-    density_scale: float = 30.0
-    """Per cube unit."""
-    objects: int = 24
-    """A step."""
-    rays: int = 128
-    """An object and step."""
-    peak_rate: float = 1e-3
-    """Of Adam."""
 
 
 class UNet(eqx.Module):

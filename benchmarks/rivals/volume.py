@@ -1,6 +1,7 @@
 """Volume rendering by quadrature inside a box, and rays of pictures to train on."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -11,6 +12,30 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 Box = tuple[float, float, float, float, float, float]  # low x y z, high x y z; cube units
 RadianceField = Callable[[Array, Array], tuple[Array, Array]]  # points, directions [n 3] -> sigma [n], rgb [n 3]
 MARGIN = 0.04  # of the box about what pictures show, cube units
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """Sizes of a field of conditioned blocks (`layers.ConditionedBlock`), and how it is trained."""
+
+    box: Box
+    """Outside is nothing."""
+    tan_half_fov: float
+    """Of all cameras."""
+    width: int = 192
+    blocks: int = 4
+    octaves: int = 6
+    """Of the points' encoding."""
+    samples: int = 48
+    """On a ray."""
+    density_scale: float = 30.0
+    """Per cube unit."""
+    objects: int = 24
+    """A step."""
+    rays: int = 128
+    """An object and step."""
+    peak_rate: float = 1e-3
+    """Of Adam."""
 
 
 class Pictures(eqx.Module):
