@@ -95,7 +95,7 @@ def draw_scenes(number: int, sources: list[Path], views: int, out: Path) -> Path
 
 
 def save_things(path: Path, things: list[LearntObject]) -> None:
-    """Write objects atomically. Their colours are told by seed and paint alone (`load_things`)."""
+    """Write objects atomically. Their colours follow from their seeds (`load_things`)."""
     ends = np.cumsum([(len(t.vertices), len(t.faces)) for t in things], axis=0)
     arrays: dict[str, Any] = {
         name: np.array([getattr(t, name) for t in things]) for name in ("half_extent", "kind", "family", "seed")
@@ -104,7 +104,6 @@ def save_things(path: Path, things: list[LearntObject]) -> None:
         "vertices": np.concatenate([t.vertices for t in things]).astype(np.float32),
         "faces": np.concatenate([t.faces for t in things]).astype(np.int32),
         "description": np.stack([t.description for t in things]).astype(np.float16),
-        "paint": np.array([_paint(t) for t in things]),
         "ends": ends,
     }
     with whole_file(path) as part, part.open("wb") as file:
@@ -117,26 +116,20 @@ def load_things(path: Path) -> list[LearntObject]:
         told = {name: file[name] for name in file.files}
     vertices, faces = (np.split(told[name], told["ends"][:-1, k]) for k, name in enumerate(("vertices", "faces")))
     things = []
-    for row, (family, seed, paint) in enumerate(zip(told["family"], told["seed"], told["paint"], strict=True)):
-        tabletop = family == TABLETOP
+    for row, (family, seed) in enumerate(zip(told["family"].tolist(), told["seed"].tolist(), strict=True)):
         things.append(
             LearntObject(
                 vertices=vertices[row],
                 faces=faces[row],
                 half_extent=float(told["half_extent"][row]),
-                colours=Coloured(sample_object(int(seed))) if tabletop else paint_of(int(seed), int(paint)).rgb,
+                colours=Coloured(sample_object(seed)) if family == TABLETOP else paint_of(seed, seed % PAINTS).rgb,
                 description=told["description"][row],
                 kind=int(told["kind"][row]),
-                family=int(family),
-                seed=int(seed),
+                family=family,
+                seed=seed,
             )
         )
     return things
-
-
-def _paint(thing: LearntObject) -> int:
-    """Which of its seed's paints a thing has; 0 for a tabletop object, which has its own."""
-    return 0 if thing.family == TABLETOP else thing.seed % PAINTS
 
 
 def _meshes(job: Job) -> tuple[ShapeSet, list[LearntObject]]:
