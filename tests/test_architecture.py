@@ -81,7 +81,6 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
         "probnerf/sampling/*",
         "probnerf/training/elbo.py",
         "probnerf/training/posterior_flow.py",
-        "benchmarks/household/network.py",
         "benchmarks/rivals/*",
     ),
     "safetensors": ("probnerf/prior/checkpoint.py", "benchmarks/rivals/model.py"),

@@ -3,15 +3,15 @@
 A network that has seen the same objects hundreds of times knows them by heart: the one that
 `benchmarks.household.train` leaves has a training loss of 108 nats and one of 169 on other objects. So a share of each
 batch is pictures of the prior's own shapes (`perception.simulation.model_pictures`), and others are of new objects.
-Training ends at its time; the learning rate follows the clock.
+Training ends at its time; the learning rate follows the clock, as in `benchmarks.household.train`.
 """
 
-import json
-import time
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, fields
+from contextlib import closing
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import tyro
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array
 
 from benchmarks.harness.machine import revision
 from benchmarks.harness.progress import say
 from benchmarks.household.latents import told_pictures
 from benchmarks.household.objects import SIZE
+from benchmarks.household.train import Clock, by_the_clock
 from foundation.whole_file import whole_file
 from foundation.worker_pool import worker_pool
 from perception.simulation.model_pictures import draw_shape
@@ -44,6 +44,7 @@ from probnerf.prior.networks import RealNVP
 from probnerf.prior.posterior_flow import NetworkSizes, PosteriorNetwork
 from probnerf.training import posterior_flow
 from probnerf.training.picture_set import Examples, PictureSet, changed
+from probnerf.training.posterior_flow import PosteriorTrainState
 from probnerf.training.settings import PosteriorTrainConfig
 from probnerf.training.shape_set import batch_of, load_shapes
 from probnerf.types import on_device
@@ -53,7 +54,7 @@ OWN = 0.6  # of the model's draws, those of N(0, I); the others are what recogni
 MOST_SQUARES = 3.0  # mean square of an object's z~ beyond which recognition has not understood it: it is left out
 SHAPES, VIEWS = 250, 2  # of a part of the model's draws
 SIZES = NetworkSizes(latent=96, context=320, trunk=320, hidden=320, condition=160)
-State = tuple[PosteriorNetwork, PosteriorNetwork, optax.OptState]  # weights, their moving average, the optimiser's
+CALL = 10  # steps between two looks at the clock
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,9 @@ class Options:
     held_out: float = 0.08
     """Share of the objects that are judged by alone; so many of the model's draws, too."""
     recipe: tyro.conf.OmitArgPrefixes[PosteriorTrainConfig] = field(
-        default_factory=lambda: PosteriorTrainConfig(batch=128, learning_rate=6e-4, final_learning_rate=1e-6)
+        default_factory=lambda: PosteriorTrainConfig(
+            steps=1_000_000, warmup=20_000, batch=128, learning_rate=6e-4, final_learning_rate=1e-6
+        )
     )
 
 
@@ -158,6 +161,13 @@ class Material:
     held_out: dict[str, np.ndarray]
 
 
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """What `draw_part` left; its draws' z is known exactly."""
+    with np.load(path, allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    return arrays | {"sd": np.zeros_like(arrays["mean"])}
+
+
 def gathered(prior: Prior, weights: Path, work: Path, model_parts: Sequence[Path], held_out: float) -> Material:
     """The objects' pictures, the scenes' and the model's own."""
     recognition = load_recognition(recognition_path(weights), prior)
@@ -166,11 +176,9 @@ def gathered(prior: Prior, weights: Path, work: Path, model_parts: Sequence[Path
         for sort, pattern in (("objects", "*.plain"), ("scenes", "scenes-*.npz"))
     }
     real = told_pictures([part for each in parts.values() for part in each], recognition, prior.model.latent)
-    drawn = [dict(np.load(path)) for path in model_parts]
-    own = {name: np.concatenate([part.pop(name) for part in drawn]) for name in tuple(drawn[0])}
-    own["sd"] = np.zeros_like(own["mean"])
+    own = [_arrays(path) for path in model_parts]
     names = [f.name for f in fields(PictureSet)]
-    every = PictureSet(**{name: np.concatenate([getattr(real, name), own[name]]) for name in names})
+    every = PictureSet(**{name: np.concatenate([getattr(real, name), *(part[name] for part in own)]) for name in names})
     sort = np.full(len(every), 2)
     sort[: len(real)] = np.arange(len(real)) >= sum(len(part.rgb) for part in parts["objects"])
     known = np.unique(every.object_id)
@@ -183,29 +191,6 @@ def gathered(prior: Prior, weights: Path, work: Path, model_parts: Sequence[Path
         {name: np.flatnonzero(these & ~out) for name, these in rows.items()},
         {name: np.flatnonzero(these & out) for name, these in rows.items()},
     )
-
-
-@eqx.filter_jit(donate="all-except-first")
-def _step(
-    fixed: tuple[Examples, RealNVP, Float[Array, ""], Float[Array, ""], PRNGKeyArray], state: State
-) -> tuple[State, dict[str, Array]]:
-    examples, flow, rate, decay, key = fixed
-    network, average, optimiser = state
-    (_, parts), gradient = jax.value_and_grad(posterior_flow.loss, has_aux=True)(network, examples, key, flow)
-    update, optimiser = _OPTIMISER.update(gradient, optimiser)
-    network = jax.tree.map(lambda a, b: a - rate * b, network, update)
-    average = jax.tree.map(lambda a, b: decay * a + (1.0 - decay) * b, average, network)
-    return (network, average, optimiser), parts
-
-
-_OPTIMISER = optax.chain(optax.clip_by_global_norm(PosteriorTrainConfig.clip), optax.scale_by_adam())
-
-
-def rate_at(share: float, recipe: PosteriorTrainConfig) -> float:
-    """The learning rate when this share of the time is over: a short rise, then a half cosine."""
-    wave = 0.5 * (1.0 + np.cos(np.pi * share))
-    peak, final = recipe.learning_rate, recipe.final_learning_rate
-    return min(1.0, share / 0.02) * (final + (peak - final) * wave)
 
 
 def judged(
@@ -230,51 +215,53 @@ def main(options: Options) -> None:
         raise ValueError(
             f"{options.work} has no pictures of objects (*.plain); `benchmarks.household.objects.make` draws them"
         )
-    count = -(-options.draws // (SHAPES * VIEWS))
+    parts = range(-(-options.draws // (SHAPES * VIEWS)))
     with worker_pool(options.processes) as pool:
-        jobs = [pool.submit(draw_part, n, options.prior, options.work) for n in range(count)]
+        jobs = [pool.submit(draw_part, n, options.prior, options.work) for n in parts]
         drawn = [job.result() for job in jobs]
     material = gathered(prior, options.prior, options.work, drawn, options.held_out)
     say(str({name: len(rows) for name, rows in material.sorts.items()}))
-    flow, pictures = prior.model.flow, material.pictures
-    start = prior.network or PosteriorNetwork(SIZES, jax.random.key(recipe.seed))
+    flow, path = prior.model.flow, network_path(out / "prior.safetensors")
+    sizes = replace(SIZES, latent=prior.model.latent)
+    start = prior.network or PosteriorNetwork(sizes, jax.random.key(recipe.seed))
     say(f"begins at {judged(start, material, flow, recipe)}")
-    sizes = np.random.default_rng(0).multinomial(recipe.batch, np.array(options.shares) / sum(options.shares))
-
-    def data_of(step: int) -> Examples:
-        rng = np.random.default_rng([recipe.seed, step, 7])
-        rows = [rng.choice(r, n) for r, n in zip(material.sorts.values(), sizes, strict=True) if len(r)]
-        return changed(pictures, np.concatenate(rows), rng, recipe)
-
-    state: State = (*(jax.tree.map(jnp.copy, start) for _ in range(2)), _OPTIMISER.init(start))
-    begun, told, step, sums = time.monotonic(), time.monotonic(), 0, list[dict[str, Array]]()
     story: dict[str, Any] = {"recipe": asdict(recipe), "pictures": sum(map(len, material.sorts.values()))}
     story |= {"shares": options.shares, "seconds": options.seconds, "revision": revision()}
-    path = network_path(out / "prior.safetensors")
+    state = posterior_flow.initial_state(start, recipe)
+    with closing(_batches(material, options.shares, recipe)) as batches:
+
+        def call(state: PosteriorTrainState) -> tuple[PosteriorTrainState, dict[str, Array]]:
+            told = []
+            for examples in islice(batches, CALL):
+                state, parts = posterior_flow.train_step((recipe, flow), state, examples)
+                told.append(parts)
+            return state, jax.tree.map(lambda *values: jnp.stack(values), *told)
+
+        history = out / "network_history.jsonl"
+        ticks = by_the_clock(call, state, recipe.steps, Clock(), options.seconds, history, every=60.0, size=CALL)
+        for state, steps in ticks:
+            save_posterior_network(path, state.average, prior.hash, story | {"steps": steps})
+    found = judged(state.average, material, flow, recipe)
+    save_posterior_network(path, state.average, prior.hash, story | {"steps": steps, "validation": found})
+    say(f"{path}: {steps} steps, {found}")
+
+
+def _batches(
+    material: Material, shares: tuple[float, float, float], recipe: PosteriorTrainConfig
+) -> Generator[Examples]:
+    """Batches without end; the next one is drawn while one is used."""
+    sizes = np.random.default_rng(0).multinomial(recipe.batch, np.array(shares) / sum(shares))
+
+    def drawn(step: int) -> Examples:
+        rng = np.random.default_rng([recipe.seed, step, 7])
+        rows = [rng.choice(r, n) for r, n in zip(material.sorts.values(), sizes, strict=True) if len(r)]
+        return changed(material.pictures, np.concatenate(rows), rng, recipe)
+
     with ThreadPoolExecutor(1) as drawer:
-        coming = drawer.submit(data_of, 0)
-        while (share := (time.monotonic() - begun) / options.seconds) < 1.0:
-            examples, coming = coming.result(), drawer.submit(data_of, step + 1)
-            decay = min(recipe.average, (1.0 + step) / (10.0 + step))
-            key = jax.random.fold_in(jax.random.key(recipe.seed), step)
-            fixed = (examples, flow, jnp.float32(rate_at(share, recipe)), jnp.float32(decay), key)
-            state, parts = _step(fixed, state)
-            step += 1
-            sums.append(parts)
-            if time.monotonic() - told > 60.0:
-                told = time.monotonic()
-                row: dict[str, Any] = {"step": step, "share": round(share, 3)}
-                row |= {name: round(float(np.mean([float(s[name]) for s in sums])), 2) for name in parts}
-                sums.clear()
-                if not all(np.isfinite(value) for value in row.values()):
-                    raise FloatingPointError(f"the loss is not finite at step {step}")
-                with (out / "network_history.jsonl").open("a") as file:
-                    file.write(json.dumps(row) + "\n")
-                save_posterior_network(path, state[1], prior.hash, story | {"steps": step})
-                say(json.dumps(row))
-    found = judged(state[1], material, flow, recipe)
-    save_posterior_network(path, state[1], prior.hash, story | {"steps": step, "validation": found})
-    say(f"{path}: {step} steps, {found}")
+        coming = drawer.submit(drawn, 0)
+        for step in count(1):
+            examples, coming = coming.result(), drawer.submit(drawn, step)
+            yield examples
 
 
 if __name__ == "__main__":

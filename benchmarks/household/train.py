@@ -136,8 +136,10 @@ def by_the_clock(
     until: float,
     history: Path,
     every: float = 10.0,
+    size: int = CALL,
 ) -> Iterator[tuple[S, int]]:
-    """Calls until the time is over; yields the state and the true count of steps every so many seconds and at the end.
+    """Calls, of `size` steps each, until the time is over; yields the state and the true count of steps every so many
+    seconds and at the end.
 
     Raises FloatingPointError if the loss is not finite.
     """
@@ -147,7 +149,7 @@ def by_the_clock(
         if share >= 1.0:
             break
         state, figures = call(at_step(state, int(steps * share)))
-        taken += CALL
+        taken += size
         if clock() - told >= every:
             told = clock()
             row = {name: round(float(jnp.mean(value)), 2) for name, value in figures.items()}

@@ -11,10 +11,11 @@ import pytest
 
 pytest.importorskip("embreex")
 
-from benchmarks.household.network import rate_at
+from benchmarks.household import network
 from benchmarks.household.objects import Job, Made, load_things, make
 from benchmarks.household.train import CALL, Options, at_step, by_the_clock, jobs_of, padded
 from perception.simulation.training_pictures import PicturePart
+from probnerf.prior.checkpoint import load_prior, recognition_path, save_prior, save_recognition
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.training import elbo, on_device
 from probnerf.training.learnt_objects import TABLETOP, LearntObject
@@ -65,13 +66,6 @@ def test_steps_follow_the_clock_and_a_loss_that_is_not_finite_ends_it(tmp_path: 
         list(by_the_clock(lambda s: (s, {"loss": jnp.array([jnp.nan])}), state, 9, clock, 1e6, tmp_path / "n.jsonl"))
 
 
-def test_rates_rise_and_fall() -> None:
-    recipe = PosteriorTrainConfig(learning_rate=1e-3, final_learning_rate=1e-5)
-    assert rate_at(0.0, recipe) == 0.0 and rate_at(0.02, recipe) == pytest.approx(1e-3, rel=0.01)
-    assert rate_at(1.0, recipe) == pytest.approx(1e-5)
-    assert rate_at(0.3, recipe) > rate_at(0.6, recipe)
-
-
 def test_a_job_leaves_shapes_pictures_and_objects_and_is_not_repeated(tmp_path: Path) -> None:
     made = make(Job("household", None, 0, 2), tmp_path)
     assert isinstance(made, Made) and 1 <= made.count <= 2
@@ -106,3 +100,25 @@ def recognition_input(shapes: ShapeSet, thing: LearntObject) -> np.ndarray:
     paint = 0 if thing.family == TABLETOP else thing.seed % PAINTS
     batch = batch_of(shapes, np.random.default_rng(0), np.array([0]), 4, 1, np.array([paint]))
     return np.asarray(batch.description[0])
+
+
+@pytest.mark.slow
+def test_a_network_learns_objects_and_the_models_own_shapes_until_its_time_is_over(tmp_path: Path) -> None:
+    weights, work = tmp_path / "prior.safetensors", tmp_path / "work"
+    work.mkdir()
+    state = elbo.initial_state(ProbNeRF(PRESETS["tiny"], jax.random.key(0)), CONFIG)
+    save_prior(weights, state.model, {})
+    save_recognition(recognition_path(weights), state.recognition, load_prior(weights).hash)
+    assert isinstance(make(Job("household", None, 0, 2), work), Made)
+    recipe = PosteriorTrainConfig(steps=1000, warmup=20, batch=16)
+    options = network.Options(weights, work, tmp_path, draws=4, seconds=5.0, processes=1, recipe=recipe)
+    network.main(options)
+    prior = load_prior(weights)
+    assert prior.network is not None and prior.network.sizes.latent == prior.model.latent
+    (part,) = work.glob("model_*.npz")
+    gathered = network.gathered(prior, weights, work, [part, part], held_out=0.0)
+    with np.load(part) as file:
+        count = len(file["mean"])
+        np.testing.assert_array_equal(gathered.pictures.mean[-count:], file["mean"])
+    assert len(gathered.sorts["model"]) > count and not gathered.pictures.sd[-2 * count :].any()
+    assert len(gathered.pictures) > 2 * count and len(gathered.sorts["scenes"]) == 0
