@@ -31,7 +31,8 @@ ORDER = {
     "Faults": ("stability",),
     "The camera": ("intrinsics",),
     "Speed": ("kernel", "frontier", "effort", "startup"),
-    "The node": ("ingest", "bus", "record"),
+    "The node": ("ingest", "bus", "record", "soak"),
+    "Many logs": ("batch",),
 }
 TABLETOP = ROOT / "benchmarks" / "checkpoints" / "tabletop" / "prior.safetensors"
 PAPER = ROOT / "benchmarks" / "checkpoints" / "paper"

@@ -34,7 +34,7 @@ from rich.console import Console
 
 from benchmarks.harness.progress import say
 from benchmarks.harness.rows import Row
-from benchmarks.harness.study import StudyOptions, Summary
+from benchmarks.harness.study import Summary, TableOptions
 from benchmarks.scenes.recording import noisy
 from benchmarks.studies.bus import box_scene
 from node.commands.live import LiveNode, _close, _Keeper
@@ -62,7 +62,7 @@ _ASK = make(f"{QUERY_REGION}_Request", header=header(0, "camera"), box_high=_COR
 
 
 @dataclass(frozen=True)
-class Options(StudyOptions):
+class Options(TableOptions):
     """The live path at speed with unplugging, floods, clock jumps, full disks and kills."""
 
     minutes: float = 10.0
