@@ -1,9 +1,11 @@
 """A batch: units an hour by the number of workers, and what it moves and keeps, from which a hundred machines follow.
 
 Real units are inferred from copies of the shipped recording, by each number of processes. Their rate leaves out what
-the start takes: it counts from the end of the first unit of each process. What a Dask scheduler has to do for a task is
-measured with logs that are empty files, so that each task fails at once and writes why: messages that scheduler and
-client send or get, heartbeats with them, and seconds, of which two workers of this machine need a part.
+the start takes: it counts from the end of the first unit of each process. Beside it stand its ratios to the first
+number of processes and to a plain loop over the same units, which runs in this process, on all of its cores, and writes
+nothing. What a Dask scheduler has to do for a task is measured with logs that are empty files, so that each task fails
+at once and writes why: messages that scheduler and client send or get, heartbeats with them, and seconds, of which two
+workers of this machine need a part.
 """
 
 import io
@@ -25,7 +27,10 @@ from benchmarks.harness.tables import Table
 from foundation.store import Store
 from node.commands.batch import FAILED, batch
 from node.commands.batch_options import BatchConfig
+from node.commands.frame import read_frame, segments_of
+from perception.inference.controller import estimate
 from perception.sources.settings import SHIPPED_LOG
+from probnerf.prior.checkpoint import load_prior
 
 MACHINES = 100
 
@@ -49,15 +54,19 @@ class Options(TableOptions):
 def main(options: Options) -> Summary:
     """Measure, and sum up."""
     logs, stages = (2, 1) if options.quick else (options.logs, options.stages)
-    rows, lines = [], []
+    rows, rates = list[Row](), dict[str, float]()
     with tempfile.TemporaryDirectory() as name:
         place = Path(name)
+        rates["plain loop"] = _plain_rate(logs, BatchConfig(stages=stages))
         for workers in options.workers:
             store = _run(place, logs, BatchConfig(workers=workers, stages=stages))
-            rate = _rate(store, workers)
-            say(f"{workers} workers: {rate:.0f} units an hour")
-            rows.append(Row("batch", "processes", f"{workers} workers", "units_per_hour", rate, "1/h", 2 * logs))
-            lines.append([str(workers), str(2 * logs), f"{rate:.0f}"])
+            rates[f"{workers} workers"] = _rate(store, workers)
+        loop, first = list(rates.values())[:2]
+        lines = [[name, str(2 * logs), f"{r:.0f}", f"{r / first:.2f}", f"{r / loop:.2f}"] for name, r in rates.items()]
+        for name, rate in rates.items():
+            figures = {"units_per_hour": rate, "ratio_to_first": rate / first, "ratio_to_loop": rate / loop}
+            rows += [Row("batch", "processes", name, k, v, "1/h" * (k[0] == "u"), 2 * logs) for k, v in figures.items()]
+            say(f"{name}: {rate:.0f} units an hour")
         sizes = store.sizes()
         units = [name for name in sizes if name.endswith(".npz")]
         kept = {
@@ -74,7 +83,8 @@ def main(options: Options) -> Summary:
         moved = {"messages": count["messages"], "message_bytes": count["bytes"], "seconds": seconds}
         moved = {name: value / tasks for name, value in moved.items()}
         rows += [Row("batch", "dask", "empty logs", f"task_{k}", v, "", tasks) for k, v in moved.items()]
-    measured = Table("Units an hour", ("workers", "units", "units/h"), lines)
+    header = ("by", "units", "units/h", f"of {options.workers[0]} workers", "of the plain loop")
+    measured = Table("Units an hour", header, lines)
     return Summary(rows, [measured, computed(options, kept, moved)])
 
 
@@ -89,6 +99,18 @@ def _run(place: Path, logs: int, config: BatchConfig, empty: bool = False) -> St
     if batch(config, Console(file=text), Console(file=text)) != (FAILED if empty else 0):
         raise RuntimeError(f"the batch failed:\n{text.getvalue()}")
     return Store(str(folder / "out"))
+
+
+def _plain_rate(logs: int, config: BatchConfig) -> float:
+    """Units an hour after the first one, of a loop that reads the log anew for each copy."""
+    prior, err, ends = load_prior(None), Console(file=io.StringIO()), list[float]()
+    for _ in range(logs):
+        options = replace(config, source=SHIPPED_LOG)
+        frame = read_frame(options, err)
+        for found in segments_of(options, frame, err):
+            estimate(frame, found, prior, config.inference, seed=0, budget_s=None, stages=config.stages)
+            ends.append(monotonic())
+    return 3600.0 * (len(ends) - 1) / (ends[-1] - ends[0])
 
 
 def _rate(store: Store, workers: int) -> float:

@@ -21,7 +21,9 @@ def test_a_hundred_machines_are_computed() -> None:
 @pytest.mark.slow
 def test_a_batch_is_measured(tmp_path: Path) -> None:
     rows = {(row.condition, row.metric): row.value for row in main(Options(tmp_path, quick=True)).rows}
-    assert rows["1 workers", "units_per_hour"] > 0 and rows["2 workers", "units_per_hour"] > 0
+    loop, one, two = (rows[by, "units_per_hour"] for by in ("plain loop", "1 workers", "2 workers"))
+    assert min(loop, one, two) > 0 and rows["2 workers", "ratio_to_first"] == two / one
+    assert rows["2 workers", "ratio_to_loop"] == two / loop and rows["plain loop", "ratio_to_loop"] == 1.0
     assert rows["shipped recording", "read_bytes"] == SHIPPED_LOG.stat().st_size
     assert 1e4 < rows["shipped recording", "unit_bytes"] < 3e6
     assert 4 <= rows["empty logs", "task_messages"] < 100 and rows["empty logs", "task_message_bytes"] < 1e5
