@@ -231,6 +231,7 @@ def main(options: Options) -> None:
     with closing(_batches(material, options.shares, recipe)) as batches:
 
         def call(state: PosteriorTrainState) -> tuple[PosteriorTrainState, dict[str, Array]]:
+            """Steps until the next look at the clock."""
             told = []
             for examples in islice(batches, CALL):
                 state, parts = posterior_flow.train_step((recipe, flow), state, examples)

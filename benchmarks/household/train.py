@@ -122,6 +122,7 @@ def at_step(state: S, step: int) -> S:
     """The state with its count of steps, and those of its optimiser, set."""
 
     def told(leaf: Any) -> Any:
+        """An optimiser's counts of steps are its only integers."""
         return jnp.asarray(step, leaf.dtype) if leaf.ndim == 0 and jnp.issubdtype(leaf.dtype, jnp.integer) else leaf
 
     counted = jax.tree.map(told, state.optimiser)

@@ -56,6 +56,7 @@ class Diffusion(eqx.Module):
         k0, k1 = jax.random.split(key)
 
         def one(x, given):
+            """x_(t-1) of x_t."""
             t, key = given
             alpha = kept[t] / before[t]
             noise = jax.vmap(self.noise, (0, None))(x, t)

@@ -150,6 +150,7 @@ class Functa(eqx.Module):
         truth = jnp.asarray(picture).reshape(-1, 3) / 255.0
 
         def loss(normal, key):
+            """-log p(picture, latent), estimated from some rays; the latent in units of the functaset's deviations."""
             k0, k1 = jax.random.split(key)
             rays = jax.random.randint(k0, (config.map_rays,), 0, size * size)
             rgb = self.colours(self.mean + self.deviation * normal, origin[rays], direction[rays], k1, config.samples)

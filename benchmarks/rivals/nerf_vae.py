@@ -68,6 +68,7 @@ class Encoder(eqx.Module):
         """Mean and log standard deviation from the pictures of `used` 1."""
 
         def one(rgb, T):
+            """Features of a picture; each pixel's ray is told beside its colour."""
             size = len(rgb)
             row, column = jnp.meshgrid(jnp.arange(size) + 0.5, jnp.arange(size) + 0.5, indexing="ij")
             ray = directions(T, jnp.asarray(tan_half_fov), jnp.stack([column, row], axis=-1), size)
@@ -146,6 +147,7 @@ def loss(
     rays = draw_rays(pictures, objects, targets, k4)
 
     def one(rgb, T, used, origin, direction, key):
+        """Colours of an object's rays at a draw of z, and its KL in closed form."""
         k0, k1 = jax.random.split(key)
         mean, log_deviation = model.encoder(rgb, T, config.tan_half_fov, used)
         z = mean + jnp.exp(log_deviation) * jax.random.normal(k0, mean.shape)

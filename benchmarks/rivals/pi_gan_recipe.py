@@ -78,6 +78,8 @@ def step(
     fake = draw_fake(state.generator, cameras, size, k1)
 
     def discriminator_loss(discriminator):
+        """With the penalty R1: the squared slope of its answers to real pictures."""
+
         def summed(pictures):
             logits = discriminator(pictures, cameras, new)
             return jnp.sum(logits), logits

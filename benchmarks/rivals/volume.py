@@ -144,6 +144,7 @@ def frames_and_box(
     centre = jnp.asarray(np.stack([column, row], axis=-1) + 0.5)
 
     def corners(given):
+        """Low and high of what an object's pictures show."""
         ranges, T = given
         ray = directions(
             T[:, None, None], jnp.asarray(tan_half_fov), jnp.broadcast_to(centre, (*ranges.shape, 2)), size

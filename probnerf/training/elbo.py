@@ -212,6 +212,7 @@ def optimiser_of(config: TrainConfig) -> optax.GradientTransformation:
     """Adam (paper §2.2) with gradient clipping against rare bad batches, and warm-up and cosine decay in each phase."""
 
     def schedule(solid: float, ray: float, frozen: int = 0) -> optax.Schedule:
+        """Nothing in the frozen steps, then each phase's rise to its peak, level part and fall."""
         first = min(config.solid_steps, config.steps)
         still = min(frozen, first)
         parts = [
