@@ -29,14 +29,14 @@ def joined(coordinator: str, processes: int | None, process: int | None, lost_s:
     """All devices of all processes, on one axis, "objects". To be entered before JAX computes anything.
 
     `coordinator` is HOST:PORT of process 0, or "auto" under Slurm and Open MPI, which tell all three. Raises
-    ConnectionError, one line, if a process does not come within 5 minutes or is lost. A process that is cut off, or
-    that ends while the others compute, is found after `lost_s` seconds at most; JAX then aborts the others from within,
-    with a trace of its own, and a shell that waits beside each of them prints the line.
+    ConnectionError, one line, where another process breaks off. Where one does not come within 5 minutes, says nothing
+    for `lost_s` seconds, or was the first one, JAX may abort this process from within, with a trace of its own; a shell
+    that waits beside it then prints the line.
     """
     where = None if coordinator == "auto" else coordinator
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.config.update("jax_num_cpu_devices", 1)  # of a process; its threads share the work
-    line = f"farside: error: this process was aborted, as all are where one is lost; {_AGAIN}"
+    line = f"farside: error: this process was aborted, as all are where one does not come or is lost; {_AGAIN}"
     shell = ("sh", "-c", 'read -r orderly || echo "$0" >&2', line)
     with subprocess.Popen(shell, stdin=subprocess.PIPE, start_new_session=True) as watcher:
         try:
