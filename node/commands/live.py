@@ -33,7 +33,7 @@ from perception.inference.scene import estimate_scene
 from perception.inference.schedule import config_hash, scheduled
 from perception.inference.tracker import Change, Look, Tracker
 from perception.inference.warm_up import warm_up
-from perception.observation.segmentation import Segment, segment
+from perception.observation.segmentation import NothingThere, Segment, segment
 from perception.sources.frame import Frame, Source
 from perception.sources.open_source import open_source
 from perception.sources.playback import Playback
@@ -229,6 +229,9 @@ class LiveNode:
         try:
             segments = segment(frame, None, self.config.segment)
         except ValueError as error:
+            if isinstance(error, NothingThere):  # what stood there is gone, which planners must hear
+                self._scene = {}
+                self._publish(frame, {})
             return self._trouble(str(error))
         if segments.doubt:
             self._trouble(segments.doubt)
@@ -302,8 +305,7 @@ class LiveNode:
             return
         if h.stage > 0 or h.result == StopReason.CONVERGED:  # not a mere guess, which the next frame does better
             self.recorder.write_schedule(scheduled(h, self._hash, "tracked" if look.builds_on else "fresh"))
-        message = hypotheses_message(h, self.config.controller.infer.method)
-        data = bytes(encode(message))
+        data = bytes(encode(hypotheses_message(h, self.config.controller.infer.method)))
         self.recorder.write_raw(HYPOTHESES_TOPIC, HYPOTHESES, definition(HYPOTHESES), data, h.stamp_ns)
 
     def _trouble(self, text: str) -> None:
@@ -322,8 +324,7 @@ class LiveNode:
             return
         self._told = now
         counts = self.reader.counts()
-        silent = counts.rate < 0.2
-        level: Level = "error" if counts.error else "stale" if silent else "ok"
+        level: Level = "error" if counts.error else "stale" if counts.rate < 0.2 else "ok"
         values: dict[str, object] = {"received": counts.received, "rate_hz": round(counts.rate, 2)}
         values |= {f"dropped for {name}": n for name, n in counts.dropped.items()}
         message = counts.error or (
@@ -332,10 +333,9 @@ class LiveNode:
         statuses = [DiagnosticStatus("farside: camera", level, message, values)]
         if self.recorder is not None:
             r = self.recorder
+            level = "error" if r.error else "ok"
             recorded = {"frames": r.frames, "dropped": r.dropped, "bytes": r.bytes}
-            statuses.append(
-                DiagnosticStatus("farside: recording", "error" if r.error else "ok", r.error or "recording", recorded)
-            )
+            statuses.append(DiagnosticStatus("farside: recording", level, r.error or "recording", recorded))
         self.announcer.status(list(self._scene.values()), statuses)
 
     def tally(self) -> str:

@@ -1,40 +1,49 @@
 """The whole node: a camera driver, Farside and a planner in three processes, and a recording that repeats it all."""
 
+import io
 import re
 import signal
 import subprocess
 import sys
 import time
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 from subprocess import PIPE
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 
 from calibration.hand_eye import hand_eye
 from calibration.pose_files import write_hand_eye
 from node.__main__ import main
 from node.commands.config_file import load_config
+from node.commands.live import LiveNode
 from node.commands.options import LiveConfig
 from node.ros.bus import Bus
 from node.ros.frame_tree import FrameTree
 from node.ros.messages import HYPOTHESES, NEXT_VIEW, QUERY_REGION, hypotheses_from, make
-from node.ros.settings import BusConfig
+from node.ros.planner_messages import SceneDifferences
+from node.ros.publishers import Announcer
+from node.ros.services import Answers
+from node.ros.settings import BusConfig, PlannerConfig
 from node.viewer.page import Page
 from perception.answers.hypotheses import Hypotheses
-from perception.inference.tracker import Look
+from perception.inference.tracker import Look, Tracker
 from perception.sources.recording import Log
 from perception.sources.settings import SHIPPED_LOG
-from probnerf.prior.checkpoint import save_prior
+from probnerf.prior.checkpoint import load_prior, save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from tests.calibration.robots import CAMERA, posed_views
 from tests.conftest import ROOT
 from tests.node.commands.test_replay_whole import FEW
 from tests.node.pretend_inference import pretend_live
 from tests.node.shapes import body_with_handle, free_port
+from tests.perception.cylinders import CAN, picture
 
 LAUNCH = ROOT / "launch"
 
@@ -104,6 +113,37 @@ def test_a_page_shows_what_the_node_infers(
     first, last = "underway", "converged"
     assert scenes == [{1: first}, {1: first, 2: first}, {1: last, 2: first}, {1: last, 2: last}]
     assert all(b"<html" in page for *_, page in shown)
+
+
+def test_what_is_taken_from_the_table_is_taken_from_the_planners_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also the last object, when a picture shows that nothing stands there; a camera that sees nothing takes none."""
+    told: list[list[tuple[str, int]]] = []
+    differences = SceneDifferences("/farside", PlannerConfig())
+
+    def hear(self: Announcer, objects: Any, *_: Any) -> None:
+        if (message := differences.message(objects)) is not None:
+            told.append([(it.id, it.operation) for it in message.world.collision_objects])
+            differences.sent()
+
+    monkeypatch.setattr(Announcer, "scene", hear)
+    monkeypatch.setattr(LiveNode, "_tell_status", lambda _: None)
+    pretend_live(monkeypatch, lambda look: 2 * [replace(body_with_handle(), object_id=look.object_id)])
+    save_prior(tmp_path / "tiny.safetensors", ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {})
+    said, answers, nobody = Console(file=io.StringIO()), Answers(), SimpleNamespace()
+    with Bus(BusConfig()) as bus:
+        tracker, announcer = Tracker(load_prior(tmp_path / "tiny.safetensors")), Announcer(bus)
+        node = LiveNode(LiveConfig(), tracker, announcer, answers, *cast(Any, (nobody, nobody)), None, said)
+        empty = picture(label=False)
+        node.take(picture(CAN, label=False), said)
+        assert answers.scene.objects and told == [[("farside_object_1", 0)]]
+        node.take(replace(empty, depth=np.full_like(empty.depth, np.nan)), said)
+        assert answers.scene.objects and len(told) == 1
+        node.take(empty, said)
+    assert told[1:] == [[("farside_object_1", 1)]]
+    with pytest.raises(ValueError, match="there are no hypotheses"):
+        _ = answers.scene
 
 
 def wait_for(planner: Bus, name: str, kind: str, request: Any, seconds: float = 200.0) -> Any:
