@@ -24,7 +24,6 @@ from perception.sources.topics import doubt, frame_of, not_aligned, other_camera
 
 _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 
-
 _DETECTING = 6  # times as many images wait where a detector takes its time
 
 
@@ -51,7 +50,8 @@ class TopicSource:
         self._info: Any = None
         self._by_arrival = False  # some stream has no stamps
         self._boxes: dict[int, BoxPx] = {}  # of the last detections, by id
-        self._heard: set[str] = set()  # topics on which something came since the last frame
+        self._heard: dict[str, int] = {}  # topics on which something came since the last frame, with the newest stamp
+        self._gaps: dict[str, float] = {}  # by topic: how near (ns) the nearest came to a colour image since then
         self._newest: tuple[Frame, list[BoxPx] | None] | None = None
         self._closed = False
         compressed = c.colour.endswith("/compressed")
@@ -95,12 +95,28 @@ class TopicSource:
                 self._note("silent", self._why_silent(now - heard))
 
     def _why_silent(self, seconds: float) -> str:
+        c, silent = self.config, f"no frame for {seconds:.1f} s"
+        partners = [topic for topic in (c.detections, c.depth) if topic]
         with self._changed:
-            heard = self._heard | ({self.config.info} if self._info is not None else set())
-            wanted = (self.config.info, self.config.colour, *filter(None, [self.config.depth, self.config.detections]))
+            heard = {**self._heard, **({} if self._info is None else {c.info: 0})}
+            wanted = (c.info, c.colour, *reversed(partners))  # as `_names`
             missing = [name for name, topic in zip(self._names, wanted, strict=True) if topic not in heard]
-        why = f"nothing came on {', '.join(missing)}" if missing else "no colour image found its depth or detections"
-        return f"no frame for {seconds:.1f} s: {why}; is the driver up, on this domain and with these topic names?"
+            gaps = {} if missing else {topic: float(abs(heard[topic] - heard[c.colour])) for topic in partners}
+            gaps |= self._gaps
+        if missing:
+            what = f"nothing came on {', '.join(missing)}"
+            return f"{silent}: {what}; is the driver up, on this domain and with these topic names?"
+        far = [topic for topic in partners if gaps[topic] > c.tolerance_ms * 1e6]
+        if not far:
+            return f"{silent}: nothing is to be inferred from what came; the other notes say why"
+        remedy = "synchronise the streams, or raise tolerance_ms"
+        if far[0] == c.detections:
+            remedy = (
+                "have the detector copy header.stamp of its image, or raise tolerance_ms; if it is more than"
+                f" {_DETECTING * c.waiting} images late, raise waiting"
+            )
+        within, nearest = f"within {c.tolerance_ms:g} ms", f"the nearest is {gaps[far[0]] / 1e6:.1f} ms away"
+        return f"{silent}: nothing on {far[0]} has the stamp of a colour image {within} ({nearest}); {remedy}"
 
     def _take_info(self, info: Any) -> None:
         if is_empty(info):
@@ -113,8 +129,7 @@ class TopicSource:
     def _take_colour(self, message: Any) -> None:
         with self._changed:
             c = self.config
-            self._heard.add(c.colour)
-            stamp = self._stamp(c.colour, message)
+            stamp = self._heard[c.colour] = self._stamp(c.colour, message)
             self._settle(self._matcher.push_lead(stamp, (stamp, message)))
         self._make_frame()
 
@@ -122,20 +137,22 @@ class TopicSource:
         depth = self.config.depth
         assert depth is not None
         with self._changed:
-            self._heard.add(depth)
-            self._settle(self._matcher.push_partner(depth, self._stamp(depth, message), message))
+            stamp = self._heard[depth] = self._stamp(depth, message)
+            self._settle(self._matcher.push_partner(depth, stamp, message))
         self._make_frame()
 
     def _take_detections(self, message: Any) -> None:
         topic = self.config.detections
         assert topic is not None
         with self._changed:
-            self._heard.add(topic)
-            self._settle(self._matcher.push_partner(topic, self._stamp(topic, message), message))
+            stamp = self._heard[topic] = self._stamp(topic, message)
+            self._settle(self._matcher.push_partner(topic, stamp, message))
         self._make_frame()
 
     def _labelled(self, frame: Frame, boxes: list[BoxPx] | None) -> Frame | None:
-        """The frame with the things in the boxes as its label map; None: nothing is to be seen in them."""
+        """The frame with the things in the boxes as its label map; None: nothing is to be seen in them. Without a box
+        the map names nothing: all is gone.
+        """
         if boxes is None:
             return frame
         try:
@@ -147,9 +164,9 @@ class TopicSource:
             self._note("a detection", f"a detection is left out: {reason}")
         ids = kept_ids(boxes, self._boxes)
         self._boxes = dict(zip(ids, boxes, strict=True))
-        if not label.any():  # an empty table; silence would say that the camera is down
+        if boxes and not label.any():  # said, as silence would mean that the camera is down
             self.skipped += 1
-            self._note("no detection", "a frame without a detection is passed over")
+            self._note("no detection", "a frame is passed over: nothing is to be seen in the boxes of its detections")
             return None
         return replace(frame, label=np.array([0, *ids], np.int32)[label])
 
@@ -157,6 +174,9 @@ class TopicSource:
         """Keep the newest pair, and count dropped pairs. The caller holds the lock."""
         depth = self.config.depth
         for match in matches:
+            for topic, gap in match.gaps_ns.items():
+                if gap < self._gaps.get(topic, float("inf")):
+                    self._gaps[topic] = gap
             if depth is None or match.partners[depth] is not None:
                 if self.config.detections is not None and match.partners[self.config.detections] is None:
                     self.skipped += 1
@@ -190,6 +210,7 @@ class TopicSource:
             raise ValueError(f"a frame is left out: {error}") from None  # the bus counts it
         with self._changed:
             self._heard.clear()
+            self._gaps.clear()
             self.skipped += self._newest is not None
             if self._newest is None or frame.stamp_ns > self._newest[0].stamp_ns:
                 self._newest = frame, boxes

@@ -1,5 +1,7 @@
 """Boxes of another node's detector choose what is inferred, in the picture of their stamp and frame."""
 
+import re
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -12,7 +14,7 @@ from node.ros.detections import DETECTIONS_IN, boxes_of, kept_ids
 from node.ros.messages import frame_messages, header, make
 from node.ros.settings import BusConfig, TopicConfig
 from node.ros.topic_source import TopicSource
-from perception.observation.segmentation import label_boxes, segment
+from perception.observation.segmentation import NothingThere, label_boxes, segment
 from perception.sources.frame import Frame
 from tests.node.mugs import table_frame
 
@@ -116,7 +118,37 @@ def test_pictures_are_paired_with_their_detections(bus: Bus, table: Frame) -> No
     assert next(frames).stamp_ns == START + 5 * 33_000_000
     assert any("detections are of frame 'left'" in note for note in source.notes)
     assert source.skipped >= 2 and source.dropped == 0  # pictures 0 and 2 have no detections
+    found.publish(detections(stamp=say(6).stamp_ns))
+    gone = next(frames)
+    assert gone.stamp_ns == START + 6 * 33_000_000 and gone.label is not None and not gone.label.any()
+    with pytest.raises(NothingThere):
+        segment(gone)
     source.close()
+
+
+@pytest.mark.parametrize(
+    ("late_ns", "says"),
+    [
+        (14_000_000, r"within 10 ms \(the nearest is 1[49].0 ms away\); have the detector copy header.stamp"),
+        (-3_600_000_000_000, r"\(the nearest is 36\d\d\d\d\d.0 ms away\); .* more than 60 images late, raise waiting"),
+    ],
+)
+def test_stamps_that_pair_with_no_picture_are_said(bus: Bus, table: Frame, late_ns: int, says: str) -> None:
+    """How far apart they are, and what to do, whether the pictures wait still or were given up."""
+    topics = TopicConfig(colour="/c", depth=None, info="/i", detections="/found", silence_s=0.5, end_s=2.0)
+    source, found = TopicSource(bus, topics), bus.publisher("/found", DETECTIONS_IN, depth=10)
+    colour, info = bus.publisher("/c", "sensor_msgs/msg/Image"), bus.publisher("/i", "sensor_msgs/msg/CameraInfo")
+    for i in range(4):
+        frame = replace(table, stamp_ns=START + i * 33_000_000, label=None)
+        messages = frame_messages(frame)
+        info.publish(messages["color/camera_info"])
+        colour.publish(messages["color/image_raw"])
+        found.publish(detections(about(table, 1), stamp=frame.stamp_ns + late_ns))
+        time.sleep(0.02)
+    assert list(source) == []
+    (note,) = source.notes
+    assert note.startswith("no frame for ") and "nothing on /found has the stamp of a colour image" in note
+    assert re.search(says, note), note
 
 
 def test_a_thing_keeps_its_id_whatever_its_score() -> None:
