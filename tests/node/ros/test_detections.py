@@ -102,6 +102,11 @@ def test_pictures_are_paired_with_their_detections(bus: Bus, table: Frame) -> No
         frame = replace(table, stamp_ns=START + i * 33_000_000, label=None)
         for name, message in frame_messages(frame).items():
             senders[name].publish(message)
+        deadline = time.monotonic() + 20.0  # a few wait, and the oldest are dropped
+        while (
+            any(bus.counts.of(name).get("received", 0) <= i for name in names.values()) and time.monotonic() < deadline
+        ):
+            time.sleep(0.005)
         return frame
 
     sent = [say(i) for i in range(4)]
