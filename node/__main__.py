@@ -80,14 +80,14 @@ def _replay(args: Sequence[str]) -> int:
     run = replay
     if config.schedule:
         from node.commands.replay_schedule import follow as run
-    return 0 if run(config, Console(), Console(stderr=True)) else 130
+    return 0 if run(config, Console(), Console(stderr=True, markup=False)) else 130
 
 
 def _segment(args: Sequence[str]) -> int:
     config = _configured(Segmenting, "farside segment", args)
     from node.commands.segment import segment_frame
 
-    segment_frame(config, Console(), Console(stderr=True))
+    segment_frame(config, Console(), Console(stderr=True, markup=False))
     return 0
 
 
@@ -95,7 +95,7 @@ def _live(args: Sequence[str]) -> int:
     config = _configured(LiveConfig, "farside live", args)
     from node.commands.live import live
 
-    live(config, Console(), Console(stderr=True))
+    live(config, Console(markup=False), Console(stderr=True, markup=False))
     return 0
 
 
@@ -103,14 +103,14 @@ def _batch(args: Sequence[str]) -> int:
     config = _configured(BatchConfig, "farside batch", args)
     from node.commands.batch import batch
 
-    return batch(config, Console(), Console(stderr=True))
+    return batch(config, Console(), Console(stderr=True, markup=False))
 
 
 def _record(args: Sequence[str]) -> int:
     options = tyro.cli(Record, args=args, prog="farside record")
     from node.commands.record import record
 
-    record(options, Console(), Console(stderr=True))
+    record(options, Console(), Console(stderr=True, markup=False))
     return 0
 
 
@@ -145,15 +145,15 @@ def _view(args: Sequence[str]) -> int:
             raise ValueError("--out draws a file's picture; omit it with --live")
         from node.commands.view_live import watch
 
-        watch(options.live, options.node, options.port, options.token, Console(), Console(stderr=True))
+        watch(options.live, options.node, options.port, options.token, Console(), Console(stderr=True, markup=False))
         return 0
     from node.commands.view import draw, open_page
 
     assert options.file is not None
     if options.out is None:
-        open_page(options.file, options.port, options.token, Console(), Console(stderr=True))
+        open_page(options.file, options.port, options.token, Console(), Console(stderr=True, markup=False))
     else:
-        draw(options.file, options.out, Console(), Console(stderr=True))
+        draw(options.file, options.out, Console(), Console(stderr=True, markup=False))
     return 0
 
 
@@ -168,7 +168,7 @@ def _calibrate(args: Sequence[str]) -> int:
     elif options.from_ is not None:
         copy_camera(options, options.from_, Console())
     else:
-        calibrate_camera(options, Console(), Console(stderr=True))
+        calibrate_camera(options, Console(), Console(stderr=True, markup=False))
     return 0
 
 
@@ -176,7 +176,7 @@ def _hand_eye(args: Sequence[str]) -> int:
     options = tyro.cli(HandEyeOptions, args=args, prog="farside hand-eye")
     from node.commands.hand_eye import locate_camera
 
-    locate_camera(options, Console(), Console(stderr=True))
+    locate_camera(options, Console(), Console(stderr=True, markup=False))
     return 0
 
 
@@ -184,21 +184,21 @@ def _capture(args: Sequence[str]) -> int:
     options = tyro.cli(Capture, args=args, prog="farside capture")
     from node.commands.capture import capture
 
-    return 0 if capture(options, Console(), Console(stderr=True)) else 130
+    return 0 if capture(options, Console(), Console(stderr=True, markup=False)) else 130
 
 
 def _train(args: Sequence[str]) -> int:
     options = tyro.cli(Training, args=args, prog="farside train")
     from node.commands.train import train
 
-    return 0 if train(options, Console(), Console(stderr=True)) else 130
+    return 0 if train(options, Console(), Console(stderr=True, markup=False)) else 130
 
 
 def _train_network(args: Sequence[str]) -> int:
     options = tyro.cli(NetworkTraining, args=args, prog="farside train-network")
     from node.commands.train_network import train_network
 
-    return 0 if train_network(options, Console(), Console(stderr=True)) else 130
+    return 0 if train_network(options, Console(), Console(stderr=True, markup=False)) else 130
 
 
 def _bench(args: Sequence[str]) -> int:

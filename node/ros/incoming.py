@@ -9,7 +9,7 @@ from typing import Any
 
 from foundation.one_line import one_line
 from node.ros.fair_queue import FairQueue
-from node.ros.message_counts import MessageCounts, Rate
+from node.ros.message_counts import MessageCounts, Rate, plainly
 from node.ros.rmw_zenoh import read_attachment
 from node.ros.settings import BusConfig
 
@@ -92,7 +92,7 @@ class Incoming:
             if self._refuse:
                 try:
                     if trouble:
-                        self._refuse(item, trouble)
+                        self._refuse(item, plainly(trouble))
                     item.drop()  # now, not when it is collected: the asker waits for the end of answers
                 except Exception as error:  # the client is gone
                     self._counts.add(self._name, "failed", one_line(error))

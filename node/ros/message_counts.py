@@ -4,6 +4,9 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
+
+MOST_WORDS = 500  # characters of a line that may quote what came; no control characters, which a terminal would obey
 
 
 class MessageCounts:
@@ -26,7 +29,8 @@ class MessageCounts:
             if first:
                 self._told.add((name, fate))
         if first:
-            self._say(f"{name}: {trouble} (further ones are only counted)")
+            with suppress(Exception):  # what listens goes on if nobody can be told any more
+                self._say(f"{name}: {plainly(trouble)} (further ones are only counted)")
 
     def of(self, name: str) -> dict[str, int]:
         """The counts of one full name."""
@@ -37,6 +41,12 @@ class MessageCounts:
         """The counts by full name."""
         with self._lock:
             return {name: dict(counter) for name, counter in self._counts.items()}
+
+
+def plainly(trouble: str) -> str:
+    """Words that may quote a stranger's, safe to print and to answer with."""
+    short = trouble if len(trouble) <= MOST_WORDS else f"{trouble[:MOST_WORDS]} ..."
+    return "".join(c if c.isprintable() else "\ufffd" for c in short)
 
 
 class Rate:

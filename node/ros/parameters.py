@@ -1,7 +1,8 @@
 """The node's settings as read-only ROS 2 parameters: `ros2 param list`, `get` and `describe` work, `set` is refused."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from node.ros.bus import Bus
 from node.ros.messages import make
 
 Parameter = bool | int | float | str | tuple[str, ...]
+MOST_NAMES = 1000  # of a request
 
 
 def flat(config: object, prefix: str = "") -> dict[str, Parameter]:
@@ -38,13 +40,12 @@ def serve_parameters(bus: Bus, parameters: Mapping[str, Parameter]) -> None:
     def listed(request: Any) -> Any:
         # depth 0: all names below a prefix; else names with at most `depth` more parts
         prefixes = [f"{p}." for p in request.prefixes] or [""]
-        kept = [
-            name
-            for name in names
-            for p in prefixes
-            if (name.startswith(p) or name == p[:-1])
-            and (not request.depth or name[len(p) :].count(".") < request.depth)
-        ]
+
+        def below(name: str, p: str) -> bool:
+            inside = name.startswith(p) or name == p[:-1]
+            return inside and (not request.depth or name[len(p) :].count(".") < request.depth)
+
+        kept = [name for name in names if any(below(name, p) for p in prefixes)]
         above = sorted({name.rpartition(".")[0] for name in kept} - {""})
         return reply("ListParameters", result=make(_kind("ListParametersResult"), names=kept, prefixes=above))
 
@@ -72,7 +73,15 @@ def serve_parameters(bus: Bus, parameters: Mapping[str, Parameter]) -> None:
     }
     for service, handler in handlers.items():
         snake = "".join(f"_{c.lower()}" if c.isupper() else c for c in service).strip("_")
-        bus.serve(f"~/{snake}", f"rcl_interfaces/srv/{service}", handler)
+        bus.serve(f"~/{snake}", f"rcl_interfaces/srv/{service}", partial(_of_few, handler))
+
+
+def _of_few(handler: Callable[[Any], Any], request: Any) -> Any:
+    """The handler's answer. Raises ValueError for a request of more names than any node has."""
+    for field, asked in vars(request).items():
+        if isinstance(asked, list) and len(asked) > MOST_NAMES:
+            raise ValueError(f"{field} has {len(asked)} entries; give at most {MOST_NAMES}")
+    return handler(request)
 
 
 def _kind(name: str) -> str:

@@ -17,11 +17,11 @@ from node.ros.settings import PlannerConfig
 from perception.answers.hypotheses import FrameName, Hypotheses
 from perception.answers.occupied_space import distance_field
 from perception.answers.query import query
-from perception.answers.regions import Box, Points, Swept, moved
+from perception.answers.regions import REACH, Box, Points, Swept, moved
 from perception.answers.scene import Scene
 
 BOX, POINTS, SWEPT = 0, 1, 2  # kinds of a QueryRegion request
-MAX_BOXES = 256
+MAX_BOXES = 256  # also of what is to be cleared
 RING = 5  # poses about the object, where a request names no number
 MAX_VIEWS = 100
 
@@ -104,6 +104,8 @@ class Answers:
         if max(candidates, request.count) > MAX_VIEWS:
             raise ValueError(f"{max(candidates, request.count)} views are too many; give at most {MAX_VIEWS}")
         cameras = np.stack([T_object_frame @ matrix(p) for p in request.candidates]) if candidates else None
+        if cameras is not None and not (np.abs(cameras) <= REACH).all():
+            raise ValueError(f"a candidate is beyond {REACH:g} m; give poses in metres")
         rank_views = import_module(
             "perception.answers.next_view"
         ).rank_views  # imported here: it is heavy and rarely needed
@@ -147,7 +149,10 @@ class Answers:
         """p_object = T @ p_frame of the first object and the frame that a frame_id names; raises as `_frame`."""
         frame, T_frame_asked = self._frame(name, objects)
         T = objects[0].T_object_from(frame)
-        return T if T_frame_asked is None else T @ T_frame_asked
+        T = T if T_frame_asked is None else T @ T_frame_asked
+        if not (np.abs(T) <= REACH).all():
+            raise ValueError(f"frame_id is {name!r}, whose origin /tf puts beyond {REACH:g} m")
+        return T
 
     def _frame(self, name: str, objects: Sequence[Hypotheses]) -> tuple[FrameName, Float[np.ndarray, "4 4"] | None]:
         """The frame of hypotheses that a request's frame_id names; or the camera's, and p_camera = T @ p_asked, if it
@@ -184,6 +189,11 @@ def _cleared(request: Any, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray,
         raise ValueError(
             "of what is to be cleared, each box needs a corner and a size, each sphere a centre and a radius"
         )
+    if len(boxes[0]) + len(spheres) > MAX_BOXES:
+        raise ValueError(f"{len(boxes[0]) + len(spheres)} shapes are to be cleared; give at most {MAX_BOXES}")
+    numbers = [*map(_xyz, (*boxes[0], *boxes[1], *spheres)), request.spheres_to_clear_radius_m]
+    if not (np.abs(np.concatenate(numbers)) <= REACH).all():
+        raise ValueError(f"of what is to be cleared, a number is not finite, or beyond {REACH:g} m")
     inside = np.zeros(len(points), bool)
     for low, size in zip(map(_xyz, boxes[0]), map(_xyz, boxes[1]), strict=True):
         inside |= np.all((points >= low) & (points <= low + size), axis=1)
