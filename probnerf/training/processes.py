@@ -48,7 +48,10 @@ def joined(coordinator: str, processes: int | None, process: int | None, lost_s:
             if not isinstance(error, jax.errors.JaxRuntimeError) and "Gloo" not in str(error):
                 if jax.distributed.is_initialized():
                     raise  # wrong input
-                raise ValueError(f"--coordinator {coordinator}: {one_line(error)}; give HOST:PORT") from error
+                what = one_line(error).rstrip(".")
+                raise ValueError(
+                    f"--coordinator auto found no cluster ({what}); give HOST:PORT of process 0"
+                ) from error
             raise ConnectionError(f"a process is lost, or failed ({one_line(error)[:200]}); {_AGAIN}") from error
         finally:
             watcher.communicate(b"orderly\n")
