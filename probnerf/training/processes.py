@@ -49,9 +49,7 @@ def joined(coordinator: str, processes: int | None, process: int | None, lost_s:
                 if jax.distributed.is_initialized():
                     raise  # wrong input
                 what = one_line(error).rstrip(".")
-                raise ValueError(
-                    f"--coordinator auto found no cluster ({what}); give HOST:PORT"
-                ) from error
+                raise ValueError(f"--coordinator auto found no cluster ({what}); give HOST:PORT") from error
             raise ConnectionError(f"a process is lost, or failed ({one_line(error)[:200]}); {_AGAIN}") from error
         finally:
             watcher.communicate(b"orderly\n")
