@@ -10,8 +10,7 @@ import urllib.request
 from dataclasses import replace
 from pathlib import Path
 from subprocess import PIPE
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import jax
 import numpy as np
@@ -131,10 +130,11 @@ def test_what_is_taken_from_the_table_is_taken_from_the_planners_scene(
     monkeypatch.setattr(LiveNode, "_tell_status", lambda _: None)
     pretend_live(monkeypatch, lambda look: 2 * [replace(body_with_handle(), object_id=look.object_id)])
     save_prior(tmp_path / "tiny.safetensors", ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {})
-    said, answers, nobody = Console(file=io.StringIO()), Answers(), SimpleNamespace()
+    said, answers = Console(file=io.StringIO()), Answers()
+    nobody: Any = None  # reads or keeps frames
     with Bus(BusConfig()) as bus:
         tracker, announcer = Tracker(load_prior(tmp_path / "tiny.safetensors")), Announcer(bus)
-        node = LiveNode(LiveConfig(), tracker, announcer, answers, *cast(Any, (nobody, nobody)), None, said)
+        node = LiveNode(LiveConfig(), tracker, announcer, answers, nobody, nobody, None, said)
         empty = picture(label=False)
         node.take(picture(CAN, label=False), said)
         assert answers.scene.objects and told == [[("farside_object_1", 0)]]

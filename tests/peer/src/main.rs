@@ -185,7 +185,7 @@ async fn call(node: &ZNode, types: &Types, name: &str, kind: &str, command: &Val
         None => types::message(&types.schema(&format!("{kind}_Request"))?, &command["request"])?.to_cdr()?[4..].to_vec(),
     };
     let answer = client.call_with_timeout(&Body(body), PATIENCE).await?;
-    let data = [&[0, 1, 0, 0], answer.0.as_slice()].concat();
+    let data = [&[0u8, 1, 0, 0][..], &answer.0].concat();
     let response = DynamicMessage::from_cdr(&data, &types.schema(&format!("{kind}_Response"))?)?;
     Ok(json!({"what": "answer", "name": name, "type": kind, "bytes": data.len(), "same": same(&response, &data),
         "response": types::to_json(&response)}))
