@@ -24,6 +24,7 @@ Verdict = Literal["free", "occupied", "unsure", "unseen"]
 CAUTION = 0.5
 MAX_SAMPLES = 200_000  # lattice of a box that the unseen and outside fractions are counted on
 SWEPT_SAMPLES = 20_000  # the same of swept boxes, each of which is compared with all before it
+THINNEST = 1e-9  # m; an edge below counts as this long, as a product of such may be 0
 SLAB = 1_000_000  # samples of a box that are in memory at a time
 JOINT_DRAWS = 4096  # of the scene's volume, where there are several objects
 
@@ -283,7 +284,7 @@ def _sampled(region: Swept, width: float) -> tuple[Float[np.ndarray, "3 n"], Flo
         for earlier in range(k):  # what two boxes share counts once
             own = own[:, ~region.holds(earlier, *own)]
         points.append(own)
-        shares.append(np.full(own.shape[1], np.prod(size / counts)))
+        shares.append(np.full(own.shape[1], np.prod(np.maximum(size, THINNEST) / counts)))
     return np.concatenate(points, axis=1), np.concatenate(shares)
 
 

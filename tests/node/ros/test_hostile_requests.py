@@ -17,13 +17,13 @@ from node.ros.messages import NEXT_VIEW, QUERY_REGION, header, make, pose, type_
 from node.ros.parameters import MOST_NAMES, serve_parameters
 from node.ros.planner_messages import ESDF
 from node.ros.rmw_zenoh import attachment, key
-from node.ros.services import MAX_BOXES, Answers
+from node.ros.services import MAX_BOXES, SWEPT, Answers
 from node.ros.settings import BusConfig
 from node.ros.type_descriptions import GET_TYPE_DESCRIPTION, serve_type_descriptions
 from perception.sources.settings import SHIPPED_LOG
 from tests.node.ros.test_frame_tree import frames, place
 from tests.node.ros.test_planner_services import esdf
-from tests.node.ros.test_services import ask, box
+from tests.node.ros.test_services import ask, box, oriented
 from tests.node.shapes import RIGHT, body_with_handle
 
 CDR = b"\x00\x01\x00\x00"
@@ -142,6 +142,8 @@ def test_distances_are_bounded(request_: Any, complaint: str) -> None:
 def test_regions_and_views_as_far_as_numbers_go(bus: Bus) -> None:
     wide = call(bus, "query_region", ask(**box((-1e6, -1e6, -1e6), (1e6, 1e6, 1e6))))
     assert wide.success and wide.p_free == 0.0 and 0.99 < wide.outside_fraction < 1.0
+    hair = call(bus, "query_region", ask(kind=SWEPT, boxes=[oriented(np.eye(4), (1e-300, 1e-300, 1e6))]))
+    assert hair.success and hair.p_free == 0.0 and 0.99 < hair.outside_fraction < 1.0
     T = np.eye(4)
     T[0, 3] = FAR
     for request, complaint in (
