@@ -44,7 +44,11 @@ class IndependentPeer:
         self._process = subprocess.Popen(self._command, stdin=PIPE, stdout=PIPE, text=True)
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
-        self.wait(lambda line: line["what"] == "ready")
+        try:
+            self.wait(lambda line: line["what"] == "ready")
+        except AssertionError:
+            self.__exit__(None, None, None)
+            raise
         return self
 
     def __exit__(
@@ -63,6 +67,9 @@ class IndependentPeer:
             with self._changed:
                 self.lines.append(json.loads(line))
                 self._changed.notify_all()
+        with self._changed:
+            self.lines.append({"what": "end"})
+            self._changed.notify_all()
 
     def tell(self, **command: Any) -> None:
         """Give a command."""
@@ -79,10 +86,10 @@ class IndependentPeer:
                     if wanted(line):
                         return line
                 left = deadline - time.monotonic()
-                if left <= 0 or not self._changed.wait(left):
+                if left <= 0 or {"what": "end"} in self.lines[-1:] or not self._changed.wait(left):
                     raise AssertionError(f"nothing of this kind in {seconds:g} s; last: {self.lines[-3:]}")
 
-    def call(self, service: str, kind: str, seconds: float = 120.0, **request: Any) -> dict[str, Any]:
+    def call(self, service: str, kind: str, seconds: float = 120.0, /, **request: Any) -> dict[str, Any]:
         """The line about a service's response, or about the error of the call."""
         after = len(self.lines)
         self.tell(call=service, type=kind, request=request)

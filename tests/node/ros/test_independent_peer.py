@@ -21,6 +21,7 @@ import pytest
 
 from node.ros.bus import Bus
 from node.ros.detections import DETECTIONS_IN
+from node.ros.frame_tree import TRANSFORMS, FrameTree
 from node.ros.messages import HYPOTHESES, NEXT_VIEW, QUERY_REGION, frame_messages
 from node.ros.planner_messages import DETECTIONS, ESDF, OCTOMAP, PLANNING_SCENE
 from node.ros.publishers import Announcer
@@ -80,7 +81,7 @@ SERVICES = {
 }
 
 
-def answer(peer: IndependentPeer, service: str, **request: Any) -> dict[str, Any]:
+def answer(peer: IndependentPeer, service: str, /, **request: Any) -> dict[str, Any]:
     """The response, of which hiroz must write the same bytes as came."""
     line = peer.call(service, SERVICES[service], **request)
     assert line["what"] == "answer" and line["same"], line
@@ -156,15 +157,33 @@ def test_what_it_reads_is_what_the_scene_is(peer_and_scene: tuple[IndependentPee
     sizes = [dim["size"] for dim in distances["esdf_and_gradients"]["layout"]["dim"]]
     assert distances["success"] and distances["voxel_size_m"] == pytest.approx(0.01)
     assert distances["esdf_and_gradients"]["data"]["count"] == np.prod(sizes)
-    assert distances["esdf_and_gradients"]["data"]["least"] == -1000.0
+    assert -0.04 <= distances["esdf_and_gradients"]["data"]["least"] < -0.02  # the body is 8 cm wide
     aabb = {
         "use_aabb": True,
         "aabb_min_m": {"x": -0.02, "y": 0.0, "z": 0.0},
         "aabb_size_m": {"x": 0.04, "y": 0.02, "z": 0.02},
     }
     part = answer(peer, "/farside/get_esdf_and_gradient", frame_id="object", **aabb)
-    assert [dim["size"] for dim in part["esdf_and_gradients"]["layout"]["dim"]] == [4, 2, 2]
-    assert max(part["esdf_and_gradients"]["data"]) < 0.0  # inside the body
+    assert [dim["size"] for dim in part["esdf_and_gradients"]["layout"]["dim"]] == [5, 3, 3]  # those that it meets
+    assert part["esdf_and_gradients"]["data"]["largest"] < 0.0  # inside the body
+
+
+def test_who_listens_late_gets_what_it_latched(tmp_path: Path) -> None:
+    """As /tf_static of a robot that was up before."""
+    place = {"translation": {"x": 1.5}, "rotation": {"w": 1.0}}
+    moved = {"header": {"frame_id": "base_link"}, "child_frame_id": "camera", "transform": place}
+    static = {"topic": "/tf_static", "type": TRANSFORMS, "message": {"transforms": [moved]}, "latched": True}
+    port = free_port()
+    with Bus(BusConfig(listen=(f"tcp/127.0.0.1:{port}",)), print) as bus:
+        with IndependentPeer(f"tcp/127.0.0.1:{port}", tmp_path) as peer:
+            peer.tell(publish=[static], period_s=3600.0)
+            peer.graph("/farside")  # when it answers, that is done
+            tree, deadline = FrameTree(bus), time.monotonic() + 60.0
+            while not tree.knows("camera"):
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+    assert tree.T("base_link", "camera", STAMP_NS)[0, 3] == 1.5
+    assert bus.counts.of("/tf_static") == {"received": 1}
 
 
 def test_a_node_of_its_own_is_camera_detector_and_planner(tmp_path: Path) -> None:
@@ -200,6 +219,8 @@ def test_a_node_of_its_own_is_camera_detector_and_planner(tmp_path: Path) -> Non
                     stated = {(it["type"], it["hash"], it["computed"]) for it in found if it["name"] == name}
                     ((stated_kind, stated_hash, computed),) = stated
                     assert stated_kind == kind and stated_hash == computed, name
+                quality = {(it["durability"], it["reliability"]) for it in found if it["name"] in TOPICS | SERVICES}
+                assert quality == {("Volatile", "Reliable")}
                 for name, kind in TOPICS.items():
                     peer.tell(listen=name, type=kind)
                 peer.tell(publish=published, period_s=1.0)
@@ -231,16 +252,22 @@ def _reads_everything(peer: IndependentPeer, frame_id: str) -> None:
 
 def _calls_everything(peer: IndependentPeer) -> None:
     asked = {"header": {"frame_id": "camera"}}
-    region = answer(peer, "/farside/query_region", **asked, kind=POINTS, points=[0.0, 0.0, 0.4])
-    assert region["success"] and region["objects"] == 2 and region["age"] < 100.0
-    views = answer(peer, "/farside/next_view", **asked, count=3)
+    deadline = time.monotonic() + 200.0
+    region: dict[str, Any] = {"objects": 0}
+    while region["objects"] != 2:  # the second one is inferred after the first
+        assert time.monotonic() < deadline, region
+        region = answer(peer, "/farside/query_region", **asked, kind=POINTS, points=[0.0, 0.0, 0.4])
+    assert region["success"] and 0.0 <= region["age"] < 100.0
+    # hiroz waits 10 s for an answer, and the node may compile for longer before the first one
+    lines = (peer.call("/farside/next_view", NEXT_VIEW, **asked, count=3) for _ in range(10))
+    views = next(line["response"] for line in lines if line["what"] == "answer")
     assert views["success"] and len(views["poses"]) == 3
     assert answer(peer, "/farside/get_esdf_and_gradient", frame_id="camera")["success"]
     described = answer(peer, "/farside/get_type_description", type_name=PLANNING_SCENE, include_type_sources=True)
     assert described["successful"]
     assert described["type_description"]["type_description"]["type_name"] == PLANNING_SCENE
     for topic, kind in (TOPICS | {"/farside/hypotheses": HYPOTHESES}).items():
-        if topic.startswith("/farside"):  # several nodes publish the others
+        if topic.startswith("/farside") and kind != PLANNING_SCENE:  # whose `byte` hiroz cannot take from a description
             after = len(peer.lines)
             peer.tell(discover=topic)
             line = peer.wait(lambda line: line["what"] in ("discovered", "error"), 100.0, after)

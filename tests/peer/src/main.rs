@@ -178,11 +178,12 @@ fn same(message: &DynamicMessage, data: &[u8]) -> bool {
 async fn call(node: &ZNode, types: &Types, name: &str, kind: &str, command: &Value) -> Result<Value, Trouble> {
     let client = node.create_client_impl::<Service>(name, Some(types.info(kind)?)).build()?;
     let body = match command["raw"].as_str() {
-        Some(hex) => (0..hex.len())
-            .step_by(2)
-            .map(|k| u8::from_str_radix(&hex[k..k + 2], 16))
-            .collect::<Result<Vec<u8>, _>>()?,
-        None => types::message(&types.schema(&format!("{kind}_Request"))?, &command["request"])?.to_cdr()?[4..].to_vec(),
+        Some(hex) => {
+            (0..hex.len()).step_by(2).map(|k| u8::from_str_radix(&hex[k..k + 2], 16)).collect::<Result<Vec<u8>, _>>()?
+        }
+        None => {
+            types::message(&types.schema(&format!("{kind}_Request"))?, &command["request"])?.to_cdr()?[4..].to_vec()
+        }
     };
     let answer = client.call_with_timeout(&Body(body), PATIENCE).await?;
     let data = [&[0u8, 1, 0, 0][..], &answer.0].concat();
@@ -206,8 +207,12 @@ fn publish(node: &Arc<ZNode>, types: &Types, command: &Value) -> Result<(), Trou
             let now = SystemTime::now().duration_since(UNIX_EPOCH).expect("a clock after 1970");
             for (publisher, message) in &mut topics {
                 if message.schema().field("header").is_some() {
-                    message.set_dynamic("header.stamp.sec", DynamicValue::Int32(now.as_secs() as i32)).expect("a stamp");
-                    message.set_dynamic("header.stamp.nanosec", DynamicValue::Uint32(now.subsec_nanos())).expect("a stamp");
+                    message
+                        .set_dynamic("header.stamp.sec", DynamicValue::Int32(now.as_secs() as i32))
+                        .expect("a stamp");
+                    message
+                        .set_dynamic("header.stamp.nanosec", DynamicValue::Uint32(now.subsec_nanos()))
+                        .expect("a stamp");
                 }
                 let body = message.to_cdr().expect("it was made to fit")[4..].to_vec();
                 if let Err(error) = publisher.publish(&Body(body)) {

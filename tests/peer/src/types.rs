@@ -30,7 +30,8 @@ impl Types {
         packages.push(bundled_assets_dir_for("lyrical").join("vision_msgs"));
         packages.extend_from_slice(folders);
         let paths: Vec<&Path> = packages.iter().map(PathBuf::as_path).collect();
-        let (messages, services, _) = discovery::discover_all(&paths)?;
+        let (mut messages, services, _) = discovery::discover_all(&paths)?;
+        messages.retain(|it| it.fields.iter().all(|field| field.field_type.base_type != "wstring")); // it hashes none
         let mut resolver = Resolver::new(false);
         let mut known = Self { messages: HashMap::new(), hashes: HashMap::new() };
         for message in resolver.resolve_messages(messages)? {
@@ -101,17 +102,15 @@ fn from_json(kind: &FieldType, value: &Value) -> Result<DynamicValue, Trouble> {
             DynamicValue::String(value.as_str().ok_or_else(wrong)?.to_string())
         }
         FieldType::Message(schema) => DynamicValue::Message(Box::new(message(schema, value)?)),
-        FieldType::Array(inner, _) | FieldType::Sequence(inner) | FieldType::BoundedSequence(inner, _) => {
-            match value {
-                Value::String(hex) if **inner == FieldType::Uint8 => DynamicValue::Bytes(
-                    (0..hex.len()).step_by(2).map(|k| u8::from_str_radix(&hex[k..k + 2], 16)).collect::<Result<_, _>>()?,
-                ),
-                Value::Array(items) => {
-                    DynamicValue::Array(items.iter().map(|it| from_json(inner, it)).collect::<Result<_, _>>()?)
-                }
-                _ => return Err(wrong().into()),
+        FieldType::Array(inner, _) | FieldType::Sequence(inner) | FieldType::BoundedSequence(inner, _) => match value {
+            Value::String(hex) if **inner == FieldType::Uint8 => DynamicValue::Bytes(
+                (0..hex.len()).step_by(2).map(|k| u8::from_str_radix(&hex[k..k + 2], 16)).collect::<Result<_, _>>()?,
+            ),
+            Value::Array(items) => {
+                DynamicValue::Array(items.iter().map(|it| from_json(inner, it)).collect::<Result<_, _>>()?)
             }
-        }
+            _ => return Err(wrong().into()),
+        },
     })
 }
 
