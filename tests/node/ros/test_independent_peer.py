@@ -153,6 +153,9 @@ def test_what_it_reads_is_what_the_scene_is(peer_and_scene: tuple[IndependentPee
     np.testing.assert_allclose(points["p_occupied"], [0.3, 0.7])
     refused = answer(peer, "/farside/query_region", header={"frame_id": "moon"})
     assert not refused["success"] and refused["message"].startswith("frame_id is 'moon'")
+    peer.tell(call="/farside/query_region", type=QUERY_REGION, raw=64 * "ff")  # no request at all
+    garbled = peer.wait(lambda line: line["what"] == "answer" and "bytes are no" in line["response"].get("message", ""))
+    assert garbled["same"] and not garbled["response"]["success"]
     distances = answer(peer, "/farside/get_esdf_and_gradient", frame_id="object", update_esdf=True)
     sizes = [dim["size"] for dim in distances["esdf_and_gradients"]["layout"]["dim"]]
     assert distances["success"] and distances["voxel_size_m"] == pytest.approx(0.01)
