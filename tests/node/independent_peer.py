@@ -18,7 +18,7 @@ from node.ros.messages import FOLDER
 from tests.conftest import ROOT
 
 CRATE = ROOT / "tests" / "peer"
-BUILD = "cargo build --manifest-path tests/peer/Cargo.toml"
+BUILD = "cargo build --locked --manifest-path tests/peer/Cargo.toml"
 BINARY = Path(os.environ.get("CARGO_TARGET_DIR", CRATE / "target")) / "debug" / "farside-peer"
 FOREIGN = ("moveit_msgs", "nvblox_msgs", "object_recognition_msgs", "octomap_msgs")  # hiroz has the others itself
 

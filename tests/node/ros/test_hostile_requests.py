@@ -150,6 +150,7 @@ def test_regions_and_views_as_far_as_numbers_go(bus: Bus) -> None:
         (ask(**box((-FAR, 0, 0), (FAR, 1, 1))), "not finite, or beyond"),
         (ask("far", **box(*RIGHT)), "a box's pose is not finite"),
         (ask(**box((np.nan, 0, 0), (1, 1, 1))), "not finite"),
+        (ask(kind=SWEPT, boxes=10_000 * [oriented(np.eye(4), (0.01, 0.01, 0.01))]), "there are 10000 boxes; give 1 to"),
     ):
         refused = call(bus, "query_region", request)
         assert not refused.success and complaint in refused.message

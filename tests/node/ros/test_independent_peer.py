@@ -3,7 +3,7 @@
 It is the crate hiroz 0.2.1: keys, tokens, type hashes, quality of service and CDR are its own. By hand: build it first,
 which takes some minutes, then run this.
 
-    cargo build --manifest-path tests/peer/Cargo.toml
+    cargo build --locked --manifest-path tests/peer/Cargo.toml
     .venv/bin/pytest -m slow tests/node/ros/test_independent_peer.py
 """
 
