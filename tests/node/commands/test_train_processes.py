@@ -13,7 +13,6 @@ import jax
 import numpy as np
 import pytest
 
-from node.__main__ import main
 from node.commands.training_options import Training
 from probnerf.prior.checkpoint import load_prior
 
@@ -38,7 +37,7 @@ def start_two(out: Path) -> list[subprocess.Popen[str]]:
 
 def finished(processes: Sequence[subprocess.Popen[str]]) -> None:
     for process in processes:
-        _, err = process.communicate(timeout=600)
+        _, err = process.communicate(timeout=1200)
         assert process.returncode == 0, err
 
 
@@ -81,6 +80,7 @@ def test_two_processes_with_half_a_batch_each_make_the_steps_of_one(alone: Path,
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)  # six processes compile
 @pytest.mark.parametrize("victim", [0, 1])
 def test_a_killed_process_ends_the_other_and_the_run_goes_on(two: Path, tmp_path: Path, victim: int) -> None:
     shutil.copytree(two / "shapes", tmp_path / "shapes")
@@ -100,7 +100,7 @@ def test_a_killed_process_ends_the_other_and_the_run_goes_on(two: Path, tmp_path
         np.testing.assert_array_equal(a, b)
 
 
-def test_options_that_do_not_go_together_are_named(capsys: pytest.CaptureFixture) -> None:
+def test_options_that_do_not_go_together_are_named() -> None:
     for options in ({"coordinator": "here:1"}, {"process": 0}, {"coordinator": "auto", "processes": 2, "process": 0}):
         with pytest.raises(ValueError, match="several processes need --coordinator HOST:PORT"):
             Training(**options)
@@ -108,5 +108,3 @@ def test_options_that_do_not_go_together_are_named(capsys: pytest.CaptureFixture
         Training(coordinator="here", processes=2, process=0)
     with pytest.raises(ValueError, match="--process is 2 of 2; give 0 to 1"):
         Training(coordinator="here:1", processes=2, process=2)
-    assert main(["train", "--coordinator", "here:1"]) == 1
-    assert capsys.readouterr().err.startswith("farside: error: several processes need")
