@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.studies import batch
 from benchmarks.studies.batch import Options, computed, main
+from node.commands.batch_options import BatchConfig
 from perception.sources.settings import SHIPPED_LOG
 
 
@@ -16,6 +18,13 @@ def test_a_hundred_machines_are_computed() -> None:
     assert found["logs to read, each once"] == "1 GB" and found["files written by a machine"] == "25"
     assert found["scheduler's messages (Dask)"] == "15,000" and found["scheduler's bytes (Dask)"] == "1.50 GB"
     assert found["scheduler's time, at most (Dask)"] == "2 min"  # of 1000 units and 500 logs
+
+
+def test_the_plain_loop_infers_each_object_of_each_copy(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = list[int]()
+    monkeypatch.setattr(batch, "estimate", lambda frame, found, *args, **how: seen.append(found.id))
+    assert batch._plain_rate(2, BatchConfig(stages=1)) > 0
+    assert len(seen) == 4 and seen[:2] == seen[2:]
 
 
 @pytest.mark.slow
