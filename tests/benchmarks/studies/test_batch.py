@@ -1,6 +1,8 @@
 """The measurement of a batch: rates, sizes and messages that are there, and what follows from them."""
 
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -25,6 +27,19 @@ def test_the_plain_loop_infers_each_object_of_each_copy(monkeypatch: pytest.Monk
     monkeypatch.setattr(batch, "estimate", lambda frame, found, *args, **how: seen.append(found.id))
     assert batch._plain_rate(2, BatchConfig(stages=1)) > 0
     assert len(seen) == 4 and seen[:2] == seen[2:]
+
+
+def test_rates_stand_beside_the_first_and_the_plain_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = {"logs/a/seed_0/object_1.npz": 100, "logs/a/seed_0/object_1.json": 10, "logs/a/log.json": 5}
+    monkeypatch.setattr(batch, "_plain_rate", lambda logs, config: 80.0)
+    monkeypatch.setattr(batch, "_run", lambda *args, **how: SimpleNamespace(sizes=lambda: sizes))
+    monkeypatch.setattr(batch, "_rate", lambda store, workers: 60.0 * workers)
+    monkeypatch.setattr(batch, "_messages", lambda: nullcontext({"messages": 40, "bytes": 4000}))
+    summary = main(Options(tmp_path, quick=True))
+    rows = {(row.condition, row.metric): row.value for row in summary.rows}
+    assert rows["2 workers", "ratio_to_first"] == 2.0 and rows["2 workers", "ratio_to_loop"] == 1.5
+    assert rows["1 workers", "ratio_to_loop"] == 0.75 and rows["empty logs", "task_messages"] == 2.0
+    assert summary.tables[0].lines[0] == ["plain loop", "4", "80", "1.33", "1.00"]
 
 
 @pytest.mark.slow
