@@ -36,9 +36,13 @@ def start_two(out: Path) -> list[subprocess.Popen[str]]:
 
 
 def finished(processes: Sequence[subprocess.Popen[str]]) -> None:
-    for process in processes:
-        _, err = process.communicate(timeout=1200)
-        assert process.returncode == 0, err
+    try:
+        for process in processes:
+            _, err = process.communicate(timeout=1200)
+            assert process.returncode == 0, err
+    finally:
+        for process in processes:
+            process.kill()
 
 
 def weights(out: Path) -> list[np.ndarray]:
