@@ -74,17 +74,30 @@ def judge(view: Conditioned, model: ProbNeRF, found: Found, rate: Float[np.ndarr
     weights = weights / weights.sum()
     given = pictures(model, found.likelihood, positions, view.T_object_camera)[:, 0]
     held = pictures(model, found.likelihood, positions, view.held_out.T_object_camera)
-    true_given, true_held = view.given.rgb[0] / 255.0, view.held_out.rgb / 255.0
-    known = np.broadcast_to(view.known[..., None], true_given.shape)
-    mean = np.tensordot(weights, held, 1)
     p = np.tensordot(weights, shapes(model, found.likelihood, positions), 1)
     scored = scored_voxels(~view.hidden, rate)
     values = {
-        "psnr_given": float(weights @ [psnr(picture[known], true_given[known]) for picture in given]),
-        "psnr_heldout": float(weights @ [psnr(picture, true_held) for picture in held]),
-        "psnr_heldout_of_mean": psnr(mean, true_held),
-        "pixel_sd": float(np.sqrt(np.mean(np.tensordot(weights, (held - mean) ** 2, 1)))),
+        **picture_values(view, given, held, weights),
         "hidden_nll": hidden_nll(p, rate, view.solid, scored),
         "hidden_ece": hidden_ece(p, view.solid, scored),
     }
     return Judged(values, given, held, chain)
+
+
+def picture_values(
+    view: Conditioned,
+    given: Float[np.ndarray, "S s s 3"],
+    held_out: Float[np.ndarray, "S v s s 3"],
+    weights: Float[np.ndarray, "S"] | None = None,
+) -> dict[str, float]:
+    """What `judge` says of pictures alone; the draws weigh the same unless `weights` (of sum 1) says otherwise."""
+    weights = np.full(len(given), 1.0 / len(given)) if weights is None else weights
+    true_given, true_held = view.given.rgb[0] / 255.0, view.held_out.rgb / 255.0
+    known = np.broadcast_to(view.known[..., None], true_given.shape)
+    mean = np.tensordot(weights, held_out, 1)
+    return {
+        "psnr_given": float(weights @ [psnr(picture[known], true_given[known]) for picture in given]),
+        "psnr_heldout": float(weights @ [psnr(picture, true_held) for picture in held_out]),
+        "psnr_heldout_of_mean": psnr(mean, true_held),
+        "pixel_sd": float(np.sqrt(np.mean(np.tensordot(weights, (held_out - mean) ** 2, 1)))),
+    }

@@ -23,6 +23,7 @@ from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.likelihood.settings import Likelihood
 from probnerf.prior.networks import ProbNeRF
 from probnerf.prior.posterior_network import guesses
+from probnerf.sampling.annealed_hmc import annealed_hmc
 from probnerf.sampling.mean_field import VIConfig, mean_field
 from probnerf.sampling.modes import log_posterior
 from probnerf.settings import AnnealedHMCConfig, InferConfig
@@ -32,6 +33,8 @@ CHAINS, KEPT = 8, 16
 STARTS = 128  # draws of encoder and prior each, of which the best begins VI
 VI_DRAWS = 16
 FIXED_STEP = 0.0005  # the paper's, at the last temperature
+DELTA_SCALE = 0.025  # sqrt(alpha), the paper's
+SWEPT = (0.005, 0.01, 0.05)  # others that are tried
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,11 @@ class Effort:
     iterations: int = 100
     leapfrog_steps: int = 100
     vi_steps: int = 1500
+
+    @property
+    def settings(self) -> Line:
+        """What rows keep of it."""
+        return {"schedule": f"{self.iterations}x{self.leapfrog_steps}", "vi_steps": self.vi_steps}
 
 
 SHORT = Effort(iterations=40, leapfrog_steps=25, vi_steps=600)
@@ -81,14 +89,15 @@ class Method:
     name: str
     answer: Callable[[Question], Found] = field(compare=False)
     delta: bool = False
+    delta_scale: float = DELTA_SCALE
 
     def settings(self, effort: Effort) -> Line:
         """What its rows keep."""
-        schedule = f"{effort.iterations}x{effort.leapfrog_steps}"
-        return {"schedule": schedule, "vi_steps": effort.vi_steps, "delta": self.delta}
+        scale = {} if self.delta_scale == DELTA_SCALE else {"delta_scale": self.delta_scale}
+        return {**effort.settings, "delta": self.delta, **scale}
 
 
-def _hmc(delta: bool, fixed: float | None = None) -> Callable[[Question], Found]:
+def _hmc(delta: bool, fixed: float | None = None, delta_scale: float = DELTA_SCALE) -> Callable[[Question], Found]:
     def answer(q: Question) -> Found:
         keep = max(1, round(KEPT * q.effort.iterations / 100))
         hmc = AnnealedHMCConfig(
@@ -96,8 +105,10 @@ def _hmc(delta: bool, fixed: float | None = None) -> Callable[[Question], Found]
         )
         if fixed is not None:  # one temperature, the last; the step is proportional to s
             hmc = replace(hmc, s_start=hmc.s_end, step_per_scale=fixed / hmc.s_end, tune_iterations=0)
-        config = replace(q.config(delta), method="annealed_hmc", hmc=hmc)
-        posterior, likelihood = infer(q.key, q.model, q.view.observation(q.seed), config, sample_pose=False)
+        observation = q.view.observation(q.seed)
+        likelihood = replace(likelihood_of(q.config(delta), observation, sample_pose=False), delta_scale=delta_scale)
+        args = (q.model, likelihood, observation, faces_of_view(observation, likelihood))
+        posterior = annealed_hmc(q.key, log_likelihood, args, likelihood.dim(q.model), hmc)
         return Found(posterior, likelihood, float(posterior.diagnostics.point_gradients))
 
     return answer
@@ -155,5 +166,11 @@ def _own(q: Question) -> Found:
 HMC, VI = Method("hmc", _hmc(False)), Method("vi", _vi(False))
 HMC_DELTA, VI_DELTA = Method("hmc, delta", _hmc(True), delta=True), Method("vi, delta", _vi(True), delta=True)
 FIXED = Method("fixed temperature", _hmc(False, fixed=FIXED_STEP))
+SWEEP = tuple(
+    Method(f"hmc, delta x {scale:g}", _hmc(True, delta_scale=scale), delta=True, delta_scale=scale) for scale in SWEPT
+)
 OWN, ENCODER, PRIOR = Method("tempered smc", _own), Method("encoder alone", _encoder), Method("the prior alone", _prior)
 METHODS = (HMC, HMC_DELTA, VI, VI_DELTA, OWN, ENCODER, PRIOR)
+SWEEP = tuple(
+    Method(f"hmc, delta x {scale:g}", _hmc(True, delta_scale=scale), delta=True, delta_scale=scale) for scale in SWEPT
+)

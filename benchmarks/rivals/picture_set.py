@@ -1,7 +1,7 @@
 """Pictures that the rivals learn from, on disk: one .npz, with arrays only."""
 
 import zipfile
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ class PictureSet:
     T_object_camera: Float[np.ndarray, "n v 4 4"]
     tan_half_fov: Float[np.ndarray, ""]  # of all cameras
     seed: Int64[np.ndarray, "n"]  # of each object
+    family: np.ndarray = field(default_factory=lambda: np.asarray(""))  # a text: what the objects are
 
     def save(self, path: Path) -> None:
         """Write atomically."""

@@ -63,6 +63,7 @@ def draw_pictures(options: Options) -> PictureSet:
         T_object_camera=np.concatenate([each.T_object_camera for each in drawn]),
         tan_half_fov=np.asarray(TAN_HALF_FOV, np.float32),
         seed=np.concatenate([each.seeds.astype(np.int64) for each in drawn]),
+        family=np.asarray(options.family),
     )
 
 

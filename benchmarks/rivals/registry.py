@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from benchmarks.rivals.functa import Functa, FunctaConfig
 from benchmarks.rivals.functa_recipe import functa_recipe
@@ -13,6 +13,8 @@ from benchmarks.rivals.pi_gan import PiGAN, PiGANConfig
 from benchmarks.rivals.pi_gan_recipe import pi_gan_recipe
 from benchmarks.rivals.pixel_nerf import PixelNeRF, PixelNeRFConfig, pixel_nerf_recipe
 from benchmarks.rivals.recipe import Recipe
+
+Sizes = Literal["own", "small", "tiny"]
 
 
 @dataclass(frozen=True)
@@ -25,16 +27,30 @@ class Entry:
     """Given its sizes and a key."""
     recipe: Callable[[Any], Recipe]
     """Given its sizes."""
+    label: str
+    """Its name in tables."""
+    draws: bool = False
+    """Whether its answers to one picture differ from draw to draw; otherwise it gives a point estimate."""
+    small: dict[str, Any] = field(default_factory=dict)
+    """Sizes for a quarter of an hour on one CPU core."""
     tiny: dict[str, Any] = field(default_factory=dict)
     """Sizes for tests."""
 
+    def sizes(self, which: Sizes) -> dict[str, Any]:
+        """What differs from the config's own sizes."""
+        return {"own": {}, "small": self.small, "tiny": self.tiny}[which]
 
-SMALL = {"samples": 12, "objects": 4, "rays": 64}
+
+TINY = {"samples": 12, "objects": 4, "rays": 64}
+ONE_CORE = {"width": 96, "blocks": 3, "samples": 28, "objects": 8, "rays": 48}
 RIVALS: dict[str, Entry] = {
     "functa": Entry(
         FunctaConfig,
         Functa,
         functa_recipe,
+        "Functa",
+        small={"width": 64, "layers": 5, "latent": 64, "samples": 32, "training_samples": 20, "objects": 8, "rays": 96}
+        | {"flow_hidden": 128, "diffusion_width": 128, "diffusion_blocks": 2, "map_rays": 256},
         tiny={"width": 32, "layers": 3, "latent": 16, "samples": 12, "training_samples": 12, "objects": 4, "rays": 64}
         | {"flow_hidden": 16, "diffusion_width": 16, "diffusion_blocks": 1, "map_steps": 20, "map_rays": 64},
     ),
@@ -42,12 +58,18 @@ RIVALS: dict[str, Entry] = {
         NeRFVAEConfig,
         NeRFVAE,
         nerf_vae_recipe,
-        tiny=SMALL | {"latent": 16, "channels": (8, 16), "summary": 32, "width": 32, "blocks": 2},
+        "NeRF-VAE",
+        draws=True,
+        small=ONE_CORE | {"latent": 48, "channels": (16, 32, 64, 96), "summary": 128},
+        tiny=TINY | {"latent": 16, "channels": (8, 16), "summary": 32, "width": 32, "blocks": 2},
     ),
     "pi_gan": Entry(
         PiGANConfig,
         PiGAN,
         pi_gan_recipe,
+        "pi-GAN",
+        small={"latent": 32, "mapping": 64, "width": 48, "layers": 3, "samples": 14, "batches": (24, 8)}
+        | {"channels": (32, 48, 64, 96)},
         tiny={"latent": 8, "mapping": 32, "width": 16, "layers": 2, "samples": 6, "sizes": (8, 16), "batches": (4, 4)}
         | {"channels": (16, 16, 32)},
     ),
@@ -55,7 +77,9 @@ RIVALS: dict[str, Entry] = {
         PixelNeRFConfig,
         PixelNeRF,
         pixel_nerf_recipe,
-        tiny=SMALL | {"channels": (8, 16, 16), "features": 16, "width": 32, "blocks": 2},
+        "pixelNeRF",
+        small=ONE_CORE | {"channels": (16, 32, 48, 64, 80), "features": 48},
+        tiny=TINY | {"channels": (8, 16, 16), "features": 16, "width": 32, "blocks": 2},
     ),
 }
 

@@ -20,11 +20,12 @@ import jax.numpy as jnp
 import tyro
 from jaxtyping import Array, Int, PRNGKeyArray
 
+from benchmarks.harness.machine import machine, revision
 from benchmarks.rivals.health import examine, write_png
 from benchmarks.rivals.model import save_rival
 from benchmarks.rivals.picture_set import PictureSet, load_pictures
 from benchmarks.rivals.recipe import Metrics, Phase, State
-from benchmarks.rivals.registry import RIVALS
+from benchmarks.rivals.registry import RIVALS, Entry, Sizes
 from benchmarks.rivals.volume import Box, Pictures, frames_and_box
 
 DISPATCH = 1.0  # s that steps run without returning to Python
@@ -47,8 +48,8 @@ class Options:
     """Of training, with reading the pictures and compiling."""
     seed: int = 0
     """Of weights and batches."""
-    tiny: bool = False
-    """Sizes for tests."""
+    sizes: Sizes = "own"
+    """small: for one CPU core; tiny: for tests."""
 
 
 class Run:
@@ -57,6 +58,8 @@ class Run:
     def __init__(self, options: Options):
         self._begun = time.monotonic()
         self._options = options
+        self.story: dict[str, Any] = {"seed": options.seed, "sizes": options.sizes, "data": options.data.name}
+        self.story |= {"machine": machine(), "device": jax.devices()[0].device_kind, "revision": revision()}
         options.out.mkdir(parents=True, exist_ok=True)
         self._history = options.out / f"{options.model}.history.jsonl"
         self._history.write_text("")
@@ -91,8 +94,7 @@ class Run:
     def save(self, model: Any, finished: bool = False, **figures: float) -> None:
         """Write the weights, if the last were written some time ago, or if these are the final ones."""
         if finished or self.seconds - self._saved > CHECKPOINT:
-            story = {"seconds": round(self.seconds, 1), "steps": self.steps, "data": self._options.data.name}
-            story |= {"seed": self._options.seed, "finished": finished, "device": jax.devices()[0].device_kind}
+            story = self.story | {"seconds": round(self.seconds, 1), "steps": self.steps, "finished": finished}
             name = self._options.model
             save_rival(self._options.out / f"{name}.safetensors", name, model, story | figures)
             self._saved = self.seconds
@@ -102,7 +104,7 @@ def split(given: PictureSet) -> tuple[PictureSet, PictureSet]:
     """The objects to learn, and those held out."""
     count = max(2, round(HELD_OUT * len(given.seed)))
     parts = slice(None, -count), slice(-count, None)
-    names = [f.name for f in fields(given) if f.name != "tan_half_fov"]
+    names = [f.name for f in fields(given) if getattr(given, f.name).ndim]
     learnt, new = (replace(given, **{name: getattr(given, name)[part] for name in names}) for part in parts)
     return learnt, new
 
@@ -173,6 +175,12 @@ def train_phase(
         yield state
 
 
+def sizes_of(entry: Entry, which: Sizes, size: int) -> dict[str, Any]:
+    """Sizes that differ from the config's own, for pictures of so many pixels a side."""
+    own = {"size": size} if "size" in {f.name for f in fields(entry.config)} else {}  # type: ignore[arg-type]
+    return entry.sizes(which) | own
+
+
 def main(options: Options) -> Path:
     """Train, examine, and write; the path of the weights. Raises ValueError if there is no rival of this name."""
     if options.model not in RIVALS:
@@ -183,8 +191,10 @@ def main(options: Options) -> Path:
     if given.rgb.shape[1] < 3:
         raise ValueError(f"{options.data} has {given.rgb.shape[1]} views of each object; 3 or more are examined")
     learnt, new = split(given)
+    objects, views, size = learnt.rgb.shape[:3]
+    run.story |= {"family": str(given.family), "objects": objects, "views": views, "size": size}
     pictures, box = on_device(learnt)
-    config = entry.config(box=box, tan_half_fov=float(learnt.tan_half_fov), **(entry.tiny if options.tiny else {}))
+    config = entry.config(box=box, tan_half_fov=float(learnt.tan_half_fov), **sizes_of(entry, options.sizes, size))
     recipe = entry.recipe(config)
     k0, *keys = jax.random.split(jax.random.key(options.seed), 1 + len(recipe.phases))
     state = jax.jit(recipe.start)(k0)

@@ -1,11 +1,14 @@
-"""The ProbNeRF paper's experiments on this project's own code: posterior inference and annealing, on cars.
+"""The ProbNeRF paper's experiments on this project's own code, with the systems that it compares with, on cars.
 
 Objects of the test seeds of `benchmarks.paper.families`, of known pose, each from a telling and from an untelling place
 (`benchmarks.paper.conditioned`); one colour picture and no depth. The prior was trained by
 `python -m benchmarks.paper.train`. A family whose prior is not there (people) is left out.
 
 posterior inference (the paper's figure of ablations): HMC as in the paper and mean-field VI, each with the weights'
-perturbation delta and without, beside this project's sampler, the encoder alone and the prior alone.
+perturbation delta and without, beside this project's sampler, the encoder alone and the prior alone; and the rivals
+whose weights are in benchmarks/checkpoints/paper/rivals: Functa (MAP), NeRF-VAE (draws of its encoder's answer) and
+pixelNeRF. They were trained by `python -m benchmarks.rivals.train`; a table says how long, and whether each is healthy
+alone. A point estimate has no pixel_sd, and what hidden space a rival fills is not measured.
 
 - psnr_given, psnr_heldout: of an answer's pictures from the given place (of what was given) and from four others, dB, a
   mean over draws; psnr_heldout_of_mean: of the mean picture.
@@ -20,8 +23,7 @@ the paper anneals it and at one temperature with its step of 0.0005. Chains are 
 state: best, 4th, worst. `spread` is best less worst.
 
 HMC is shortened to 40 x 25 and VI to 600 steps for two cores; `--full` runs the paper's own schedule. `--small` answers
-the first four objects anew, shows the tables of the committed rows, and how far the two differ. Fréchet distances,
-Functa and the other rivals, prior samples, and the renderer's experiment on these families are not there yet.
+the first four objects anew, shows the tables of the committed rows, and how far the two differ.
 """
 
 from collections.abc import Sequence
@@ -33,37 +35,26 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from benchmarks.harness.intervals import Figures, gap_rows, mean_rows
-from benchmarks.harness.progress import say
+from benchmarks.harness.intervals import Figures
 from benchmarks.harness.results import Line, Results, key, newest
 from benchmarks.harness.rows import Row
 from benchmarks.harness.study import ResumedOptions, Summary, results_of, resumed, selected
-from benchmarks.harness.tables import Table, gated, ranged
-from benchmarks.measures.metrics import psnr
-from benchmarks.measures.refitted import refit
-from benchmarks.paper.cars import Car
-from benchmarks.paper.conditioned import PLACES, Conditioned, base_rate
+from benchmarks.harness.tables import Table
+from benchmarks.paper import annealing, gate, posteriors
+from benchmarks.paper.experiment import UNITS, Run
 from benchmarks.paper.families import FAMILIES, SPLITS, Family
-from benchmarks.paper.judged import judge, pictures
-from benchmarks.paper.methods import CHAINS, ENCODER, FIXED, HMC, METHODS, PRIOR, SHORT, Effort, Question
+from benchmarks.paper.methods import ENCODER, METHODS, PRIOR, SHORT, Effort
+from benchmarks.paper.rival_answers import keep_training, trained_rivals, training_table
 from probnerf.prior.checkpoint import Prior, load_prior
 
 WEIGHTS = Path(__file__).resolve().parent.parent / "checkpoints" / "paper"
-RATED = range(200)  # training seeds that the base rate is of
-UNITS = {
-    "psnr_given": "dB", "psnr_heldout": "dB", "psnr_heldout_of_mean": "dB", "pixel_sd": "", "hidden_nll": "nats",
-    "hidden_ece": "",
-}  # fmt: skip
-BACK = PLACES["cars"][0]
-ANNEALING = "annealing, cars from behind"
-COMPARED = (HMC, FIXED)
-FIT, GATE, LEAST_IOU = "fit to the solid", "the prior's gate", 0.85
-ORDER = ("best", "4th", "worst", "spread")
+RIVALS = WEIGHTS / "rivals"
+SMALL = 4  # objects of an experiment that `--small` answers anew
 
 
 @dataclass(frozen=True)
 class Options(ResumedOptions):
-    """The paper's experiments: posterior inference and annealing, on cars."""
+    """The paper's experiments, on cars."""
 
     full: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """The paper's own schedules; without, shorter ones for two cores."""
@@ -75,6 +66,10 @@ class Options(ResumedOptions):
     """Only these, separated by semicolons."""
     methods: str = ""
     """Only these of the posterior inference, separated by semicolons."""
+    experiments: str = ""
+    """Only these, separated by semicolons: gate, posteriors, annealing."""
+    rivals: Annotated[Path, tyro.conf.arg(metavar="DIR")] = RIVALS
+    """Folder of the rivals' weights."""
     seed: int = 0
     """Of the samplers."""
 
@@ -89,30 +84,56 @@ class Options(ResumedOptions):
         names = selected(self.families, list(FAMILIES), "family")
         return [FAMILIES[name] for name in names if weights_of(FAMILIES[name]).is_file()]
 
+    @property
+    def count(self) -> int:
+        """Objects of an experiment."""
+        return 1 if self.quick else min(self.n, SMALL) if self.small else self.n
+
+
+EXPERIMENTS = ("gate", "posteriors", "annealing")
+
 
 def weights_of(family: Family) -> Path:
     """The family's prior."""
     return WEIGHTS / f"{family.name}.safetensors"
 
 
+def prior_of(family: Family) -> Prior:
+    """The family's prior. Raises ValueError where it learnt another family, and as `load_prior` does."""
+    path = weights_of(family)
+    prior = load_prior(path)
+    if (learnt := prior.metadata.get("family")) != family.name:
+        raise ValueError(
+            f"{path} was trained on '{learnt}', not on '{family.name}'; train one with"
+            f" `python -m benchmarks.paper.train --family {family.name}`"
+        )
+    return prior
+
+
 def main(options: Options) -> Summary:
     """Measure what the file lacks, and sum up what it has."""
-    _ = selected(options.methods, [m.name for m in METHODS], "method")
+    asked = selected(options.methods, [m.name for m in METHODS], "method")
+    wanted = selected(options.experiments, EXPERIMENTS, "experiment")
     results, families = results_of("paper", options), options.chosen
     if not families:
         raise ValueError(
             f"{WEIGHTS} holds no prior; train one with `python -m benchmarks.paper.train`, and copy it there"
         )
-    priors = {family.name: load_prior(weights_of(family)) for family in families}
-
+    priors = {family.name: prior_of(family) for family in families}
+    rivals = {family.name: trained_rivals(options.rivals, family) for family in families if family.name == "cars"}
     anew = Results(options.out / "paper-small.jsonl") if options.small else results
 
     def measure() -> None:
         for family in families:
-            _gate(options, family, priors[family.name], anew)
-            _posteriors(options, family, priors[family.name], anew)
-        if "cars" in priors:
-            _annealing(options, priors["cars"], anew)
+            run = Run(family, priors[family.name], anew, options.count, options.effort, options.seed, options.quick)
+            own = rivals.get(family.name, [])
+            keep_training(run, own)
+            if "gate" in wanted:
+                gate.measure(run)
+            if "posteriors" in wanted:
+                posteriors.measure(run, [m for m in METHODS if m.name in asked], own)
+            if "annealing" in wanted and family.name == "cars":
+                annealing.measure(replace(run, count=max(1, run.count // 3)))
 
     def summed() -> Summary | None:
         found = summary(results.lines, replace(options, small=False))
@@ -123,122 +144,20 @@ def main(options: Options) -> Summary:
     return resumed(anew, options, measure, summed)
 
 
-def _count(options: Options) -> int:
-    return 1 if options.quick else min(options.n, 4) if options.small else options.n
-
-
-def _gate(options: Options, family: Family, prior: Prior, results: Results) -> None:
-    for seed in SPLITS["test"][: _count(options)]:
-        line: Line = {
-            "prior": prior.identity, "method": FIT, "settings": {}, "condition": f"{family.name}, {GATE}",
-            "object": seed, "seed": options.seed,
-        }  # fmt: skip
-        if line not in results:
-            iou = round(refit(prior.model, family.name, family.draw(seed).mesh, seed).iou, 4)
-            results.add({**line, "iou": iou})
-            say(f"{line['condition']}, {seed}: iou {iou:.3f}")
-
-
-def _posteriors(options: Options, family: Family, prior: Prior, results: Results) -> None:
-    rate, asked = None, selected(options.methods, [m.name for m in METHODS], "method")
-    for seed in SPLITS["test"][: _count(options)]:
-        for place in PLACES[family.name]:
-            view = Conditioned(family, seed, place, prior.model.preset.image_size)
-            for method in (m for m in METHODS if m.name in asked):
-                line: Line = {
-                    "prior": prior.identity, "method": method.name, "settings": method.settings(options.effort),
-                    "condition": f"{family.name}, {place.name}", "object": seed, "seed": options.seed,
-                }  # fmt: skip
-                if line in results:
-                    continue
-                rate = base_rate(family, RATED[:20] if options.quick else RATED) if rate is None else rate
-                found = method.answer(Question(view, prior.model, options.effort, options.seed))
-                values = judge(view, prior.model, found, rate).values
-                kept = {name: round(value, 5) for name, value in values.items()}
-                results.add({**line, **kept, "gradients": found.gradients, "result": found.posterior.result})
-                say(
-                    f"{line['condition']}, {seed}, {method.name}: given {kept['psnr_given']:.1f} dB, held out"
-                    f" {kept['psnr_heldout']:.1f} dB, sd {kept['pixel_sd']:.3f}, hidden {kept['hidden_nll']:.3f} nats"
-                )
-
-
-def rear_seeds(count: int) -> list[int]:
-    """Vehicles of the annealing: the first ambulance of the test seeds, then the first others."""
-    seeds, ambulance = SPLITS["test"], None
-    for seed in seeds:
-        car = FAMILIES["cars"].draw(seed)
-        if isinstance(car, Car) and car.style == "ambulance":
-            ambulance = seed
-            break
-    assert ambulance is not None
-    return [ambulance, *(seed for seed in seeds[:count] if seed != ambulance)][:count]
-
-
-def _annealing(options: Options, prior: Prior, results: Results) -> None:
-    for seed in rear_seeds(max(1, _count(options) // 3)):
-        view = Conditioned(FAMILIES["cars"], seed, BACK, prior.model.preset.image_size)
-        for method in COMPARED:
-            line: Line = {
-                "prior": prior.identity, "method": method.name, "settings": method.settings(options.effort),
-                "condition": ANNEALING, "object": seed, "seed": options.seed,
-            }  # fmt: skip
-            if line in results:
-                continue
-            found = method.answer(Question(view, prior.model, options.effort, options.seed))
-            last = found.posterior.positions[-CHAINS:]  # the chains' last states
-            made = pictures(prior.model, found.likelihood, last, view.T_object_camera)[:, 0]
-            each = [round(psnr(picture, view.given.rgb[0] / 255.0), 3) for picture in made]
-            acceptance = round(float(found.posterior.diagnostics.acceptance), 3)
-            results.add({**line, "chains": each, "acceptance": acceptance, "result": found.posterior.result})
-            say(f"{ANNEALING}, {seed}, {method.name}: {min(each):.1f} to {max(each):.1f} dB, acceptance {acceptance}")
-
-
 def summary(lines: list[Line], options: Options) -> Summary | None:
     """Figures of the first `n` objects; None where there are none."""
     rows: list[Row] = []
-    tables: list[Table] = []
-    identities = dict.fromkeys(line["prior"] for line in lines)
-    schedule = {m.name: m.settings(options.effort) for m in (*METHODS, FIXED)}
-    schedule[FIT] = {}
-    lines = [x for p in identities for x in newest([y for y in lines if y["settings"] == schedule[y["method"]]], p)]
-    if gated_lines := [line for line in lines if line["method"] == FIT and line["object"] in _seeds(options)]:
-        tables.append(_gate_table(gated_lines, rows))
-    for condition in dict.fromkeys(x["condition"] for x in lines if x["condition"] != ANNEALING and x["method"] != FIT):
-        own = [line for line in lines if line["condition"] == condition and line["object"] in _seeds(options)]
-        cells = []
-        for method in [m.name for m in METHODS if any(line["method"] == m.name for line in own)]:
-            values = {line["object"]: line for line in own if line["method"] == method}
-            for metric, unit in UNITS.items():
-                rows += mean_rows("paper", method, condition, metric, [x[metric] for x in values.values()], unit)
-            reference = {line["object"]: line for line in own if line["method"] == HMC.name}
-            both = [seed for seed in values if seed in reference]
-            for metric in ("psnr_heldout", "hidden_nll"):
-                pair = ([x[seed][metric] for seed in both] for x in (values, reference))
-                rows += gap_rows("paper", method, condition, f"{metric}_above_hmc", *pair, unit=UNITS[metric])
-            of = Figures(rows)
-            digits = {"dB": 1}
-            cells.append(
-                [method, str(len(values))]
-                + [ranged(of.interval(condition, method, m), digits.get(u, 3)) for m, u in UNITS.items()]
-                + [ranged(of.interval(condition, method, "hidden_nll_above_hmc"), sign="+")]
-            )
-        tables.append(Table(condition, ("method", "n", *UNITS, "hidden_nll above hmc's"), cells))
-    chains = [line for line in lines if line["condition"] == ANNEALING]
-    if chains:
-        tables.append(_chain_table(chains, rows))
+    effort = options.effort.settings
+    lines = [x for x in lines if all(x["settings"].get(name, value) == value for name, value in effort.items())]
+    lines = [x for identity in dict.fromkeys(x["prior"] for x in lines) for x in newest(lines, identity)]
+    seeds = SPLITS["test"][: options.count]
+    tables = [
+        *gate.tables(lines, rows, seeds),
+        *training_table(lines),
+        *posteriors.tables(lines, rows, list(FAMILIES), seeds),
+        *annealing.tables(lines, rows),
+    ]
     return Summary(rows, tables, lambda: _draw(Figures(rows))) if rows else None
-
-
-def _gate_table(lines: Sequence[Line], rows: list[Row]) -> Table:
-    cells = []
-    for condition in dict.fromkeys(line["condition"] for line in lines):
-        values = [line["iou"] for line in lines if line["condition"] == condition]
-        rows += mean_rows("paper", FIT, condition, "iou", values, "")
-        mean = Figures(rows).interval(condition, FIT, "iou")
-        cells.append(
-            [condition, str(len(values)), gated(ranged(mean), mean.mean, least=LEAST_IOU), f"{min(values):.3f}"]
-        )
-    return Table("z~ fitted to the solid", ("", "n", f"iou, gate >= {LEAST_IOU:g}", "lowest"), cells)
 
 
 def agreement(anew: Sequence[Line], kept: Sequence[Line]) -> Table:
@@ -252,45 +171,26 @@ def agreement(anew: Sequence[Line], kept: Sequence[Line]) -> Table:
     return Table("Made anew, beside the kept rows", ("", "unit", "answers", "median difference", "largest"), cells)
 
 
-def _seeds(options: Options) -> range:
-    return SPLITS["test"][: _count(options)]
-
-
-def _chain_table(lines: Sequence[Line], rows: list[Row]) -> Table:
-    cells = []
-    for method in (m.name for m in COMPARED if any(line["method"] == m.name for line in lines)):
-        own = [line for line in lines if line["method"] == method]
-        each = np.sort(np.array([line["chains"] for line in own]), axis=1)[:, ::-1]
-        values = dict(zip(ORDER[:3], each[:, [0, 3, -1]].T, strict=True))
-        values["spread"] = each[:, 0] - each[:, -1]
-        for name in ORDER:
-            rows += mean_rows("paper", method, ANNEALING, f"psnr_given, {name}", values[name], "dB")
-        of = Figures(rows)
-        acceptance = np.mean([line["acceptance"] for line in own])
-        shown = [ranged(of.interval(ANNEALING, method, f"psnr_given, {name}"), 1) for name in ORDER]
-        cells.append([method, str(len(own)), *shown, f"{acceptance:.2f}"])
-    return Table(f"{ANNEALING}: psnr of the given view by chain, dB", ("method", "n", *ORDER, "acceptance"), cells)
-
-
 def _draw(of: Figures) -> Figure:
     """Held-out quality against diversity, and what is said of hidden space, by condition."""
-    conditions = [c for c in of.conditions() if c != ANNEALING and not c.endswith(GATE)]
+    conditions = posteriors.drawn(of, list(FAMILIES))
     figure = Figure(figsize=(11, 3.4 * max(len(conditions), 1)), layout="constrained")
     axes = figure.subplots(max(len(conditions), 1), 2, squeeze=False)
-    for (left, right), condition in zip(axes, conditions, strict=True):
-        for k, method in enumerate(of.methods(condition)):
-            if method in (PRIOR.name, ENCODER.name):
-                mark = "s"
-            else:
-                mark = "o"
-            x, y = of(condition, method, "pixel_sd"), of.interval(condition, method, "psnr_heldout")
-            left.errorbar(x, y.mean, [[y.mean - y.low], [y.high - y.mean]], fmt=mark, color=f"C{k}", label=method)
-            nll = of.interval(condition, method, "hidden_nll")
-            right.errorbar(nll.mean, k, xerr=[[nll.mean - nll.low], [nll.high - nll.mean]], fmt=mark, color=f"C{k}")
+    for (left, right), condition in zip(axes, conditions, strict=False):
+        names = of.methods(condition)
+        for k, method in enumerate(names):
+            mark = "s" if method in (PRIOR.name, ENCODER.name) else "o"
+            y = of.interval(condition, method, "psnr_heldout")
+            x = of(condition, method, "pixel_sd") if (condition, method, "pixel_sd") in of else 0.0  # a point estimate
+            colour = f"C{k % 10}"
+            left.errorbar(x, y.mean, [[y.mean - y.low], [y.high - y.mean]], fmt=mark, color=colour, label=method)
+            if (condition, method, "hidden_nll") in of:
+                nll = of.interval(condition, method, "hidden_nll")
+                right.errorbar(nll.mean, k, xerr=[[nll.mean - nll.low], [nll.high - nll.mean]], fmt=mark, color=colour)
         left.set_ylim(5.0, 35.0)  # intervals of few objects reach farther
         right.set_xlim(0.0, 2.0)
         left.set(title=condition, xlabel="sd of held-out pixels between draws", ylabel="psnr of held-out views, dB")
         left.legend(fontsize=8)
-        right.set(xlabel="hidden_nll, nats (lower is better)", yticks=range(len(of.methods(condition))))
-        right.set_yticklabels(of.methods(condition), fontsize=8)
+        right.set(xlabel="hidden_nll, nats (lower is better)", yticks=range(len(names)))
+        right.set_yticklabels(names, fontsize=8)
     return figure

@@ -86,7 +86,7 @@ def test_rays_pass_through_pixel_centres():
 @pytest.mark.slow
 def test_a_run_ends_in_time_and_its_file_is_a_rival(balls, tmp_path):
     balls.save(tmp_path / "balls.npz")
-    options = Options("functa", tmp_path / "balls.npz", tmp_path / "out", seconds=60.0, tiny=True)
+    options = Options("functa", tmp_path / "balls.npz", tmp_path / "out", seconds=60.0, sizes="tiny")
     main(options)
     rows = [json.loads(line) for line in (options.out / "functa.history.jsonl").read_text().splitlines()]
     last = {row["phase"]: row for row in rows if "phase" in row}

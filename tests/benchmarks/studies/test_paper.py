@@ -10,13 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.paper import annealing, gate, posteriors
+from benchmarks.paper.annealing import ANNEALING, rear_seeds
 from benchmarks.paper.conditioned import HELD_OUT, OBJECT_RAYS, PLACES, SIZE, Conditioned, base_rate, rays_of
 from benchmarks.paper.families import BODIES, CARS
 from benchmarks.paper.judged import judge, pictures, shapes
 from benchmarks.paper.methods import FIXED, HMC, HMC_DELTA, PRIOR, VI_DELTA, Effort, Found, Method, Question
 from benchmarks.rivals.methods import weighted_posterior
 from benchmarks.studies import paper
-from benchmarks.studies.paper import ANNEALING, Options, main, rear_seeds
+from benchmarks.studies.paper import Options, main
 from probnerf.inference import likelihood_settings
 from probnerf.pixel_status import OBJECT
 from probnerf.prior.checkpoint import save_prior
@@ -119,11 +121,11 @@ def test_rows_are_kept_and_summed_up(tmp_path: Path, model: ProbNeRF, monkeypatc
     monkeypatch.setattr(paper, "SHORT", SHORT)
     values = {"psnr_given": 20.0, "psnr_heldout": 10.0, "psnr_heldout_of_mean": 11.0, "pixel_sd": 0.1}
     values |= {"hidden_nll": 0.3, "hidden_ece": 0.05}
-    monkeypatch.setattr(paper, "judge", lambda *_: SimpleNamespace(values=values))
-    monkeypatch.setattr(paper, "base_rate", lambda *_: None)
-    monkeypatch.setattr(paper, "refit", lambda *_: SimpleNamespace(iou=0.9))
+    monkeypatch.setattr(posteriors, "judge", lambda *_: SimpleNamespace(values=values))
+    monkeypatch.setattr(posteriors, "base_rate", lambda *_: None)
+    monkeypatch.setattr(gate, "refit", lambda *_: SimpleNamespace(iou=0.9))
     tints = np.linspace(0.0, 1.0, 8)[:, None, None, None, None]
-    monkeypatch.setattr(paper, "pictures", lambda *_: np.broadcast_to(tints, (8, 1, SIZE, SIZE, 3)))
+    monkeypatch.setattr(annealing, "pictures", lambda *_: np.broadcast_to(tints, (8, 1, SIZE, SIZE, 3)))
     asked: list[str] = []
 
     def noted(method: Method) -> Method:
@@ -134,14 +136,19 @@ def test_rows_are_kept_and_summed_up(tmp_path: Path, model: ProbNeRF, monkeypatc
         return replace(method, answer=answer)
 
     monkeypatch.setattr(paper, "METHODS", (noted(HMC), noted(PRIOR)))
-    options = {"quick": True, "families": "cars;bodies", "results": tmp_path / "kept.jsonl"}
+    options: dict[str, Any] = {
+        "quick": True,
+        "rivals": tmp_path,
+        "families": "cars;bodies",
+        "results": tmp_path / "kept.jsonl",
+    }
     found = main(Options(tmp_path, **options))
     assert asked == ["hmc", "the prior alone"] * 2
     titles = [t.title for t in found.tables]
-    assert titles[:3] == ["z~ fitted to the solid", "cars, back", "cars, three-quarter view"]
+    assert titles[0] == "z~ fitted to the solid" and titles[2:4] == ["cars, back", "cars, three-quarter view"]
     assert "0.900" in found.tables[0].lines[0][2] and found.tables[0].lines[0][2].endswith("pass")
     value = {(r.condition, r.method, r.metric): r.value for r in found.rows}
-    assert value["cars, back", "hmc", "hidden_nll_above_hmc"] == 0.0
+    assert value["cars, back", "the prior alone", "hidden_nll_above_hmc"] == 0.0
     assert value[ANNEALING, "hmc", "psnr_given, best"] > value[ANNEALING, "hmc", "psnr_given, worst"]
     assert found.picture is not None and found.picture().axes
     assert main(Options(tmp_path, **options)).rows == found.rows and len(asked) == 4

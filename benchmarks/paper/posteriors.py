@@ -1,0 +1,91 @@
+"""Posterior inference: an object seen from one place, answered by ProbNeRF's samplers and by the rivals."""
+
+from collections.abc import Sequence
+
+from benchmarks.harness.intervals import Figures
+from benchmarks.harness.progress import say
+from benchmarks.harness.results import Line
+from benchmarks.harness.rows import Row
+from benchmarks.harness.tables import Table
+from benchmarks.paper.conditioned import PLACES, Conditioned, base_rate
+from benchmarks.paper.experiment import Run, answer_table
+from benchmarks.paper.families import Family
+from benchmarks.paper.judged import judge, picture_values
+from benchmarks.paper.methods import METHODS, Method, Question
+from benchmarks.paper.rival_answers import TrainedRival, answered
+
+RATED = range(200)  # training seeds that the base rate is of
+
+
+class Rated:
+    """The base rate of a family's voxels, found when it is first asked for."""
+
+    def __init__(self, family: Family, quick: bool) -> None:
+        self._family, self._seeds, self._rate = family, RATED[:20] if quick else RATED, None
+
+    def __call__(self):
+        """Share of the training objects that occupy each voxel."""
+        if self._rate is None:
+            self._rate = base_rate(self._family, self._seeds)
+        return self._rate
+
+
+def measure(run: Run, methods: Sequence[Method], rivals: Sequence[TrainedRival]) -> None:
+    """Answers of all methods and rivals to each object from each place. Rivals answer to whole pictures only."""
+    rate = Rated(run.family, run.quick)
+    for seed in run.seeds:
+        for place in PLACES[run.family.name]:
+            view = Conditioned(run.family, seed, place, run.prior.model.preset.image_size)
+            condition = f"{run.family.name}, {place.name}"
+            for method in methods:
+                keep_answer(run, method, view, condition, seed, rate)
+            for rival in [] if place.left_half else [r for r in rivals if r.answers]:
+                keep_rival(run, rival, view, condition, seed)
+
+
+def keep_answer(run: Run, method: Method, view: Conditioned, condition: str, thing: int | str, rate: Rated) -> None:
+    """Add the row of one method's answer, if the file lacks it."""
+    if (line := run.missing(method.name, method.settings(run.effort), condition, thing)) is None:
+        return
+    found = method.answer(Question(view, run.prior.model, run.effort, run.seed))
+    kept = _rounded(judge(view, run.prior.model, found, rate()).values)
+    run.results.add({**line, **kept, "gradients": found.gradients, "result": found.posterior.result})
+    say(f"{condition}, {thing}, {method.name}: {_said(kept)}, hidden {kept['hidden_nll']:.3f} nats")
+
+
+def keep_rival(run: Run, rival: TrainedRival, view: Conditioned, condition: str, thing: int | str) -> None:
+    """Add the row of one rival's answer, if the file lacks it."""
+    if (line := run.missing(rival.label, rival.settings, condition, thing)) is None:
+        return
+    values = picture_values(view, *answered(rival, view, run.seed))
+    if not rival.draws:
+        del values["pixel_sd"]  # a point estimate
+    kept = _rounded(values)
+    run.results.add({**line, **kept})
+    say(f"{condition}, {thing}, {rival.label}: {_said(kept)}")
+
+
+def _rounded(values: dict[str, float]) -> dict[str, float]:
+    return {name: round(value, 5) for name, value in values.items()}
+
+
+def _said(kept: dict[str, float]) -> str:
+    sd = f", sd {kept['pixel_sd']:.3f}" if "pixel_sd" in kept else ""
+    return f"given {kept['psnr_given']:.1f} dB, held out {kept['psnr_heldout']:.1f} dB{sd}"
+
+
+def tables(lines: Sequence[Line], rows: list[Row], families: Sequence[str], seeds: range) -> list[Table]:
+    """One of each place."""
+    found = []
+    for name in families:
+        for place in PLACES[name]:
+            condition = f"{name}, {place.name}"
+            if own := [x for x in lines if x["condition"] == condition and x["object"] in seeds]:
+                found.append(answer_table(condition, own, rows, [m.name for m in METHODS]))
+    return found
+
+
+def drawn(of: Figures, families: Sequence[str]) -> list[str]:
+    """Conditions with figures."""
+    every = [f"{name}, {place.name}" for name in families for place in PLACES[name]]
+    return [condition for condition in every if condition in of.conditions()]
