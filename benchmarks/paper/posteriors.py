@@ -11,7 +11,7 @@ from benchmarks.paper.conditioned import PLACES, Conditioned, base_rate
 from benchmarks.paper.experiment import Run, answer_table
 from benchmarks.paper.families import Family
 from benchmarks.paper.judged import judge, picture_values
-from benchmarks.paper.methods import METHODS, Method, Question
+from benchmarks.paper.methods import METHODS, SWEEP, Method, Question
 from benchmarks.paper.rival_answers import TrainedRival, answered
 
 RATED = range(200)  # training seeds that the base rate is of
@@ -80,7 +80,9 @@ def tables(lines: Sequence[Line], rows: list[Row], families: Sequence[str], seed
     for name in families:
         for place in PLACES[name]:
             condition = f"{name}, {place.name}"
-            if own := [x for x in lines if x["condition"] == condition and x["object"] in seeds]:
+            swept = [m.name for m in SWEEP]  # in a table of their own
+            own = [x for x in lines if x["condition"] == condition and x["object"] in seeds]
+            if own := [x for x in own if x["method"] not in swept]:
                 found.append(answer_table(condition, own, rows, [m.name for m in METHODS]))
     return found
 

@@ -143,5 +143,9 @@ def training_table(lines: Sequence[Line]) -> list[Table]:
         counts = [f"{line[name]:,}" for name in ("parameters", "steps", "objects", "pictures", "size")]
         health = [f"{line[name]:.1f}" if name in line else "" for name in HEALTH]
         cells.append([line["method"], *counts, seconds, line["trained_on"], *health])
+    if cells:
+        missing = [e.label for e in RIVALS.values() if e.label not in [cell[0] for cell in cells]]
+        blank = [""] * 6
+        cells += [[label, *blank, "no weights: left out", *[""] * len(HEALTH)] for label in missing]
     header = ("method", "parameters", "steps", "objects", "pictures", "px", "seconds", "machine", *HEALTH)
     return [Table(f"Models, {TRAINING}", header, cells)] if cells else []

@@ -22,6 +22,19 @@ annealing (the paper's figure of an ambulance's rear): vehicles from behind, 8 c
 the paper anneals it and at one temperature with its step of 0.0005. Chains are sorted by psnr_given of their last
 state: best, 4th, worst. `spread` is best less worst.
 
+prior samples (the paper's table of FIDs): the Fréchet distance of each method's objects from true ones, each seen once,
+in features of a network that was trained apart from all methods (`benchmarks.rivals.features`), at equal n. It falls
+with n: only columns can be compared, beside the distance of two sets of true pictures.
+
+delta: HMC on informative views with other scales sqrt(alpha); and other people's cars, which the prior does not know
+(`--meshes`: a folder of Gazebo's models, which is not part of this repository).
+
+renderers (the paper's figure of acceptance): `farside bench acceptance` on cars, from a draw (z~, delta) of the prior.
+
+decoders: pixels a second of this decoder, and of decoders that are told the latent at each point, in one run.
+
+The first table has the paper's claims with a verdict each, computed from these rows (`benchmarks.paper.claims`).
+
 HMC is shortened to 40 x 25 and VI to 600 steps for two cores; `--full` runs the paper's own schedule. `--small` answers
 the first four objects anew, shows the tables of the committed rows, and how far the two differ.
 """
@@ -40,15 +53,16 @@ from benchmarks.harness.results import Line, Results, key, newest
 from benchmarks.harness.rows import Row
 from benchmarks.harness.study import ResumedOptions, Summary, results_of, resumed, selected
 from benchmarks.harness.tables import Table
-from benchmarks.paper import annealing, gate, posteriors
+from benchmarks.paper import annealing, claims, decoders, deltas, gate, posteriors, prior_samples, renderers
 from benchmarks.paper.experiment import UNITS, Run
 from benchmarks.paper.families import FAMILIES, SPLITS, Family
 from benchmarks.paper.methods import ENCODER, METHODS, PRIOR, SHORT, Effort
-from benchmarks.paper.rival_answers import keep_training, trained_rivals, training_table
+from benchmarks.paper.rival_answers import TrainedRival, keep_training, trained_rivals, training_table
 from probnerf.prior.checkpoint import Prior, load_prior
 
 WEIGHTS = Path(__file__).resolve().parent.parent / "checkpoints" / "paper"
 RIVALS = WEIGHTS / "rivals"
+FEATURES = WEIGHTS / "features.safetensors"
 SMALL = 4  # objects of an experiment that `--small` answers anew
 
 
@@ -67,9 +81,13 @@ class Options(ResumedOptions):
     methods: str = ""
     """Only these of the posterior inference, separated by semicolons."""
     experiments: str = ""
-    """Only these, separated by semicolons: gate, posteriors, annealing."""
+    """Only these, separated by semicolons: gate, posteriors, annealing, samples, renderers, decoders, sweep, others."""
     rivals: Annotated[Path, tyro.conf.arg(metavar="DIR")] = RIVALS
     """Folder of the rivals' weights."""
+    features: Annotated[Path, tyro.conf.arg(metavar="FILE")] = FEATURES
+    """Weights of the network of features."""
+    meshes: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: none)")] = None
+    """Folder of Gazebo's models: other people's cars."""
     seed: int = 0
     """Of the samplers."""
 
@@ -90,7 +108,7 @@ class Options(ResumedOptions):
         return 1 if self.quick else min(self.n, SMALL) if self.small else self.n
 
 
-EXPERIMENTS = ("gate", "posteriors", "annealing")
+EXPERIMENTS = ("gate", "posteriors", "annealing", "samples", "renderers", "decoders", "sweep", "others")
 
 
 def weights_of(family: Family) -> Path:
@@ -132,8 +150,8 @@ def main(options: Options) -> Summary:
                 gate.measure(run)
             if "posteriors" in wanted:
                 posteriors.measure(run, [m for m in METHODS if m.name in asked], own)
-            if "annealing" in wanted and family.name == "cars":
-                annealing.measure(replace(run, count=max(1, run.count // 3)))
+            if family.name == "cars":
+                _of_cars(options, run, wanted, own)
 
     def summed() -> Summary | None:
         found = summary(results.lines, replace(options, small=False))
@@ -142,6 +160,24 @@ def main(options: Options) -> Summary:
         return Summary(found.rows, [*found.tables, agreement(anew.lines, results.lines)], found.picture)
 
     return resumed(anew, options, measure, summed)
+
+
+def _of_cars(options: Options, run: Run, wanted: Sequence[str], rivals: Sequence[TrainedRival]) -> None:
+    """The experiments that the paper made on cars alone, each on some of the objects."""
+    part = replace(run, count=max(1, run.count if options.small else run.count // 3))
+    if "annealing" in wanted:
+        annealing.measure(part)
+    if "samples" in wanted and (features := prior_samples.features_in(options.features)) is not None:
+        counts = prior_samples.COUNTS[:1] if options.quick or options.small else prior_samples.COUNTS
+        prior_samples.measure(run, rivals, features, counts)
+    if "renderers" in wanted:
+        renderers.measure(part)
+    if "decoders" in wanted:
+        decoders.measure(part, rivals)
+    if "sweep" in wanted:
+        deltas.measure_sweep(part)
+    if "others" in wanted and options.meshes is not None:
+        deltas.measure_others(part, options.meshes, rivals)
 
 
 def summary(lines: list[Line], options: Options) -> Summary | None:
@@ -156,7 +192,12 @@ def summary(lines: list[Line], options: Options) -> Summary | None:
         *training_table(lines),
         *posteriors.tables(lines, rows, list(FAMILIES), seeds),
         *annealing.tables(lines, rows),
+        *prior_samples.tables(lines, rows),
+        *renderers.tables(lines, rows),
+        *deltas.tables(lines, rows, seeds),
+        *decoders.tables(lines, rows),
     ]
+    tables = [*claims.tables(lines, options.effort), *tables]
     return Summary(rows, tables, lambda: _draw(Figures(rows))) if rows else None
 
 
