@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 import numpy as np
-import tyro
 from jaxtyping import Bool, Float, UInt8
 
+from benchmarks.harness.command import command
 from benchmarks.harness.progress import say
 from benchmarks.paper.bodies import draw_person
 from benchmarks.paper.cars import draw_car
@@ -29,6 +29,15 @@ from probnerf.types import BASE_Z
 SPLITS = {"train": range(0, 1_000_000), "val": range(1_000_000, 2_000_000), "test": range(2_000_000, 3_000_000)}
 TAN_HALF_FOV = 64.0 / 131.25  # SRN's cameras
 VIEWS = 50
+
+
+def seeds_of(split: str, count: int) -> range:
+    """The first seeds of a split. Raises ValueError for one that is not known, or where none are asked for."""
+    if split not in SPLITS:
+        raise ValueError(f"no split '{split}'; there are: {', '.join(SPLITS)}")
+    if count < 1:
+        raise ValueError(f"{count} objects were asked for; give 1 or more")
+    return SPLITS[split][:count]
 
 
 class Subject(Protocol):
@@ -161,7 +170,7 @@ class Options:
     """Folder of the instances."""
     family: Literal["cars", "bodies"] = "cars"
     """What is drawn."""
-    split: Literal["train", "val", "test"] = "train"
+    split: str = "train"
     """Of which seeds."""
     count: int = 2458
     """Objects, the first seeds."""
@@ -173,7 +182,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Write what the folder lacks. An instance is whole if its last pose is there."""
-    for done, seed in enumerate(SPLITS[options.split][: options.count], start=1):
+    for done, seed in enumerate(seeds_of(options.split, options.count), start=1):
         if not (options.out / f"{seed:07d}" / "pose" / f"{options.views - 1:06d}.txt").is_file():
             write_srn(FAMILIES[options.family], seed, options.out, options.views, options.size)
         if done % 100 == 0 or done == options.count:
@@ -181,4 +190,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    command(main, Options)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from benchmarks.harness.command import command
 from benchmarks.harness.machine import revision
 from benchmarks.harness.progress import say
 from benchmarks.paper.families import FAMILIES, SPLITS, shape_set, view_set
@@ -123,4 +124,4 @@ def _solid_phase(
 
 
 if __name__ == "__main__":
-    say(str(main(tyro.cli(Options))))
+    command(main, Options)

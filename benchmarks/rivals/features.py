@@ -15,9 +15,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 
+from benchmarks.harness.command import command
 from benchmarks.harness.machine import machine, revision
 from benchmarks.harness.progress import say
 from benchmarks.paper.cars import STYLES, draw_car
@@ -161,4 +161,4 @@ def main(options: Options) -> Path:
 
 
 if __name__ == "__main__":
-    say(str(main(tyro.cli(Options))))
+    command(main, Options)

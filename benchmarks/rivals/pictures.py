@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import tyro
 
+from benchmarks.harness.command import command
 from benchmarks.harness.progress import say
-from benchmarks.paper.families import FAMILIES, SPLITS, TAN_HALF_FOV, view_set
+from benchmarks.paper.families import FAMILIES, TAN_HALF_FOV, seeds_of, view_set
 from benchmarks.rivals.picture_set import PictureSet
 from foundation.worker_pool import worker_pool
 from probnerf.training.pictures import ViewSet
@@ -30,7 +30,7 @@ class Options:
     """The file, .npz."""
     family: Literal["cars", "bodies"] = "cars"
     """What is drawn."""
-    split: Literal["train", "val", "test"] = "train"
+    split: str = "train"
     """Of which seeds."""
     count: int = 1500
     """Objects, the first seeds."""
@@ -49,7 +49,7 @@ def draw(family: str, views: int, size: int, seeds: Sequence[int]) -> ViewSet:
 
 def draw_pictures(options: Options) -> PictureSet:
     """All pictures, objects in the order of their seeds."""
-    seeds = SPLITS[options.split][: options.count]
+    seeds = seeds_of(options.split, options.count)
     parts = [seeds[start : start + PART] for start in range(0, len(seeds), PART)]
     drawn = []
     with worker_pool(options.processes) as pool:
@@ -74,4 +74,4 @@ def main(options: Options) -> Path:
 
 
 if __name__ == "__main__":
-    say(str(main(tyro.cli(Options))))
+    command(main, Options)

@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import tyro
 from jaxtyping import Array, Int, PRNGKeyArray
 
+from benchmarks.harness.command import command
 from benchmarks.harness.machine import machine, revision
 from benchmarks.rivals.health import examine, write_png
 from benchmarks.rivals.model import save_rival
@@ -31,6 +31,7 @@ from benchmarks.rivals.volume import Box, Pictures, frames_and_box
 DISPATCH = 1.0  # s that steps run without returning to Python
 REPORT = 4.0  # s between rows of the history
 CHECKPOINT = 30.0  # s between files of the weights
+HALVED = 16  # px; sides of pictures are multiples of it for encoders that halve them four times
 HELD_OUT = 0.02  # of the objects: the last ones, examined and never trained on
 
 
@@ -190,6 +191,11 @@ def main(options: Options) -> Path:
     given = load_pictures(options.data)
     if given.rgb.shape[1] < 3:
         raise ValueError(f"{options.data} has {given.rgb.shape[1]} views of each object; 3 or more are examined")
+    if options.model in ("pixel_nerf", "nerf_vae") and given.rgb.shape[2] % HALVED:
+        raise ValueError(
+            f"{options.data} has pictures of {given.rgb.shape[2]} px; {options.model} halves them four times: draw them"
+            f" with --size {-(-given.rgb.shape[2] // HALVED) * HALVED}"
+        )
     learnt, new = split(given)
     objects, views, size = learnt.rgb.shape[:3]
     run.story |= {"family": str(given.family), "objects": objects, "views": views, "size": size}
@@ -217,4 +223,4 @@ def main(options: Options) -> Path:
 
 
 if __name__ == "__main__":
-    print(main(tyro.cli(Options)))
+    command(main, Options)
