@@ -1,4 +1,4 @@
-"""A module's command, `python -m benchmarks...`: what is wrong with its input is said in one line, as by `farside`.
+"""A module's command, `python -m benchmarks...`: what is wrong with its input is said in one line, as by `farside`."""
 
 from collections.abc import Callable
 from typing import Any

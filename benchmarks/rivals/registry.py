@@ -49,7 +49,7 @@ RIVALS: dict[str, Entry] = {
         Functa,
         functa_recipe,
         "Functa",
-        small={"width": 64, "layers": 5, "latent": 64, "samples": 32, "training_samples": 20, "objects": 8, "rays": 96}
+        small={"width": 64, "layers": 5, "latent": 64, "samples": 32, "training_samples": 16, "objects": 4, "rays": 80}
         | {"flow_hidden": 128, "diffusion_width": 128, "diffusion_blocks": 2, "map_rays": 256},
         tiny={"width": 32, "layers": 3, "latent": 16, "samples": 12, "training_samples": 12, "objects": 4, "rays": 64}
         | {"flow_hidden": 16, "diffusion_width": 16, "diffusion_blocks": 1, "map_steps": 20, "map_rays": 64},
@@ -68,8 +68,8 @@ RIVALS: dict[str, Entry] = {
         PiGAN,
         pi_gan_recipe,
         "pi-GAN",
-        small={"latent": 32, "mapping": 64, "width": 48, "layers": 3, "samples": 14, "batches": (24, 8)}
-        | {"channels": (32, 48, 64, 96)},
+        small={"latent": 32, "mapping": 64, "width": 32, "layers": 3, "samples": 10, "batches": (12, 6)}
+        | {"channels": (32, 48, 64, 96), "shares": (0.5, 0.5)},
         tiny={"latent": 8, "mapping": 32, "width": 16, "layers": 2, "samples": 6, "sizes": (8, 16), "batches": (4, 4)}
         | {"channels": (16, 16, 32)},
     ),
@@ -78,7 +78,7 @@ RIVALS: dict[str, Entry] = {
         PixelNeRF,
         pixel_nerf_recipe,
         "pixelNeRF",
-        small=ONE_CORE | {"channels": (16, 32, 48, 64, 80), "features": 48},
+        small=ONE_CORE | {"channels": (16, 24, 32, 48, 64), "features": 24, "objects": 4, "rays": 96},
         tiny=TINY | {"channels": (8, 16, 16), "features": 16, "width": 32, "blocks": 2},
     ),
 }
