@@ -50,7 +50,7 @@ RIVALS: dict[str, Entry] = {
         functa_recipe,
         "Functa",
         small={"width": 64, "layers": 5, "latent": 64, "samples": 32, "training_samples": 16, "objects": 4, "rays": 80}
-        | {"flow_hidden": 128, "diffusion_width": 128, "diffusion_blocks": 2, "map_rays": 256},
+        | {"flow_hidden": 128, "diffusion_width": 128, "diffusion_blocks": 2, "map_rays": 128},
         tiny={"width": 32, "layers": 3, "latent": 16, "samples": 12, "training_samples": 12, "objects": 4, "rays": 64}
         | {"flow_hidden": 16, "diffusion_width": 16, "diffusion_blocks": 1, "map_steps": 20, "map_rays": 64},
     ),
