@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from benchmarks.harness.rows import Row
 from benchmarks.harness.tables import Table, ranged
 from benchmarks.paper.conditioned import PLACES, Conditioned
 from benchmarks.paper.experiment import Run, answer_table
+from benchmarks.paper.families import Subject
 from benchmarks.paper.methods import DELTA_SCALE, HMC, HMC_DELTA, OWN, SWEEP
 from benchmarks.paper.posteriors import Rated, keep_answer, keep_rival
 from benchmarks.paper.rival_answers import TrainedRival
@@ -38,13 +40,17 @@ def measure_others(run: Run, folder: Path, rivals: Sequence[TrainedRival]) -> No
     rate = Rated(run.family, run.quick)
     for index, name in enumerate(MODELS[: run.count]):
         subject = read_road_mesh(folder, name)
-        family = replace(run.family, draw=lambda _, subject=subject: subject)
+        family = replace(run.family, draw=partial(_always, subject))
         for place in PLACES[run.family.name]:
             view = Conditioned(family, index, place, run.prior.model.preset.image_size)
             for method in ON_OTHERS:
                 keep_answer(run, method, view, f"{OTHERS}, {place.name}", name, rate)
             for rival in (r for r in rivals if r.answers):
                 keep_rival(run, rival, view, f"{OTHERS}, {place.name}", name)
+
+
+def _always(subject: Subject, seed: int) -> Subject:
+    return subject
 
 
 def tables(lines: Sequence[Line], rows: list[Row], seeds: range) -> list[Table]:

@@ -73,8 +73,8 @@ def measure(run: Run, rivals: Sequence[TrainedRival], features: FeatureFile, cou
             if (line := run.missing(name, settings, condition_of(run.family.name, n), 0)) is None:
                 continue
             if truth is None:
-                truth = features_of(features.model, jnp.asarray(_true(run, 0)(n, T)))
-            distance = frechet_distance(features_of(features.model, jnp.asarray(made(n, T))), truth)
+                truth = features_of(features.model, _true(run, 0)(n, T))
+            distance = frechet_distance(features_of(features.model, made(n, T)), truth)
             run.results.add({**line, "distance": round(distance, 4)})
             say(f"{line['condition']}, {name}: {distance:.3f}")
 

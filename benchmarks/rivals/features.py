@@ -70,9 +70,13 @@ class Features(eqx.Module):
 
 
 @eqx.filter_jit
-def features_of(model: Features, rgb: Float[Array, "n s s 3"]) -> Float[Array, "n f"]:
-    """Of pictures in [0, 1]."""
+def _features_of(model: Features, rgb: Float[Array, "n s s 3"]) -> Float[Array, "n f"]:
     return jax.lax.map(model, rgb, batch_size=64)
+
+
+def features_of(model: Features, rgb: Float[np.ndarray, "n s s 3"]) -> Float[np.ndarray, "n f"]:
+    """Of pictures in [0, 1]."""
+    return np.asarray(_features_of(model, jnp.asarray(rgb)))
 
 
 def load_features(path: Path) -> tuple[Features, dict[str, Any]]:
@@ -133,7 +137,7 @@ class Options:
 def train(options: Options, pictures: PictureSet, sizes: FeatureSizes = FeatureSizes()) -> dict[str, float]:
     """Train, write, and say what is told of objects that were not learnt."""
     begun, batch = time.monotonic(), 64
-    (style, numbers), count = labels(pictures), len(pictures.seed)
+    (style, numbers), count = map(jnp.asarray, labels(pictures)), len(pictures.seed)
     new = max(1, round(NEW * count))
     rng = np.random.default_rng(options.seed)
     model = Features(sizes, jax.random.key(options.seed))
@@ -146,7 +150,7 @@ def train(options: Options, pictures: PictureSet, sizes: FeatureSizes = FeatureS
         if (t + 1) % 250 == 0:
             say(f"{t + 1}  " + "  ".join(f"{name} {float(value):.4f}" for name, value in metrics.items()))
     rgb, views = pictures.rgb[-new:].reshape(-1, *pictures.rgb.shape[2:]), pictures.rgb.shape[1]
-    told = loss(state[0], jnp.asarray(rgb), np.repeat(style[-new:], views), numbers[-new:].reshape(-1, 6))[1]
+    told = loss(state[0], jnp.asarray(rgb), jnp.repeat(style[-new:], views), numbers[-new:].reshape(-1, 6))[1]
     figures = {f"{name}_new": round(float(value), 4) for name, value in told.items()}
     story = {"steps": options.steps, "objects": count - new, "views": views, "size": rgb.shape[1], "seed": options.seed}
     story |= {"seconds": round(time.monotonic() - begun, 1), "machine": machine(), "revision": revision()}
