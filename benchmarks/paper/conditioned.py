@@ -5,7 +5,7 @@ or near its outline. Each stands for four pixels (`power` 4), where the paper co
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -150,6 +150,7 @@ def rays_of(T_object_camera: Float[np.ndarray, "4 4"]) -> tuple[Float[np.ndarray
     return np.asarray(origins), np.asarray(directions)
 
 
+@cache
 def base_rate(family: Family, seeds: range) -> Float[np.ndarray, "g g g"]:
     """Share of these objects that occupy each voxel."""
     return np.mean([coarsen(walls(family.draw(seed).mesh), GRID) for seed in seeds], axis=0)

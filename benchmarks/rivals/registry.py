@@ -32,7 +32,7 @@ class Entry:
     draws: bool = False
     """Whether its answers to one picture differ from draw to draw; otherwise it gives a point estimate."""
     small: dict[str, Any] = field(default_factory=dict)
-    """Sizes for a quarter of an hour on one CPU core."""
+    """Sizes for minutes on one CPU core."""
     tiny: dict[str, Any] = field(default_factory=dict)
     """Sizes for tests."""
 
@@ -42,14 +42,14 @@ class Entry:
 
 
 TINY = {"samples": 12, "objects": 4, "rays": 64}
-ONE_CORE = {"width": 96, "blocks": 3, "samples": 28, "objects": 8, "rays": 48}
+ONE_CORE = {"width": 64, "blocks": 2, "samples": 24, "objects": 6, "rays": 64, "peak_rate": 2e-3}
 RIVALS: dict[str, Entry] = {
     "functa": Entry(
         FunctaConfig,
         Functa,
         functa_recipe,
         "Functa",
-        small={"width": 64, "layers": 5, "latent": 64, "samples": 32, "training_samples": 16, "objects": 4, "rays": 80}
+        small={"width": 64, "layers": 4, "latent": 64, "samples": 24, "training_samples": 16, "objects": 4, "rays": 64}
         | {"flow_hidden": 128, "diffusion_width": 128, "diffusion_blocks": 2, "map_rays": 128},
         tiny={"width": 32, "layers": 3, "latent": 16, "samples": 12, "training_samples": 12, "objects": 4, "rays": 64}
         | {"flow_hidden": 16, "diffusion_width": 16, "diffusion_blocks": 1, "map_steps": 20, "map_rays": 64},
