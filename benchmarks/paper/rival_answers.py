@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from benchmarks.harness.results import Line
-from benchmarks.harness.tables import Table
+from benchmarks.harness.tables import Table, verdict
 from benchmarks.paper.conditioned import SIZE, Conditioned
 from benchmarks.paper.experiment import Run
 from benchmarks.paper.families import Family, render
@@ -23,6 +23,7 @@ from benchmarks.rivals.model import Conditioned as Answering
 from benchmarks.rivals.registry import RIVALS, load
 
 TRAINING = "how each was trained"
+LEAST_SHOWN = 20.0  # dB: a rival that shows pictures of its own training set worse than this is not healthy
 HEALTH = ("psnr_given_learnt", "psnr_others_learnt", "psnr_given_new", "psnr_others_new")
 
 
@@ -142,10 +143,18 @@ def training_table(lines: Sequence[Line]) -> list[Table]:
         seconds = f"{line['seconds']:.0f}" if line["seconds"] >= 0 else "not recorded"
         counts = [f"{line[name]:,}" for name in ("parameters", "steps", "objects", "pictures", "size")]
         health = [f"{line[name]:.1f}" if name in line else "" for name in HEALTH]
-        cells.append([line["method"], *counts, seconds, line["trained_on"], *health])
+        gate = verdict(line[HEALTH[0]], least=LEAST_SHOWN) if HEALTH[0] in line else ""
+        cells.append([line["method"], *counts, seconds, line["trained_on"], *health, gate])
     if cells:
         missing = [e.label for e in RIVALS.values() if e.label not in [cell[0] for cell in cells]]
         blank = [""] * 6
-        cells += [[label, *blank, "no weights: left out", *[""] * len(HEALTH)] for label in missing]
+        cells += [[label, *blank, "no weights: left out", *[""] * (len(HEALTH) + 1)] for label in missing]
     header = ("method", "parameters", "steps", "objects", "pictures", "px", "seconds", "machine", *HEALTH)
+    header = (*header, f"healthy alone: {HEALTH[0]} >= {LEAST_SHOWN:g} dB")
     return [Table(f"Models, {TRAINING}", header, cells)] if cells else []
+
+
+def unhealthy(lines: Sequence[Line]) -> dict[str, float]:
+    """What rivals show of their own training set, dB, where it is below the gate."""
+    own = [line for line in lines if line["condition"].endswith(TRAINING) and HEALTH[0] in line]
+    return {line["method"]: line[HEALTH[0]] for line in own if line[HEALTH[0]] < LEAST_SHOWN}

@@ -11,6 +11,7 @@ from benchmarks.paper.decoders import COST
 from benchmarks.paper.methods import FIXED, HMC, HMC_DELTA, SHORT, VI
 from benchmarks.paper.prior_samples import COUNTS, condition_of
 from benchmarks.paper.renderers import RENDERERS
+from benchmarks.paper.rival_answers import TRAINING
 
 
 def answers(method: str, metric: str, values: list[float], condition: str = BACK) -> list[Line]:
@@ -59,6 +60,9 @@ def test_each_claim_follows_its_rows() -> None:
     assert of(lines, delta) == NOT
     lines = answers(HMC.name, "psnr_given", up) + answers(FUNCTA, "psnr_given", down)
     assert of(lines, "Functa's MAP on the given view (cars, back)").startswith(CAVEAT)  # a smaller model
+    ill = answers(FUNCTA, "psnr_given_learnt", [17.04], f"cars, {TRAINING}")
+    assert of(lines + ill, "Functa's MAP on the given view (cars, back)").startswith(f"{UNMEASURED}: Functa is not")
+    assert "17.0 dB" in of(lines + ill, "Functa's MAP on the given view (cars, back)")
     lines = answers(HMC.name, "pixel_sd", [0.5, 0.6]) + answers(VI.name, "pixel_sd", [0.1, 0.2])
     assert "tempered" in of(lines, "hmc is more diverse than vi on held-out views (cars, back)")
 
