@@ -28,7 +28,7 @@ ON_OTHERS = (HMC, HMC_DELTA, OWN)
 
 def measure_sweep(run: Run) -> None:
     """HMC with other scales of delta on informative views; two of them are in the posterior inference already."""
-    rate = Rated(run.family, run.quick)
+    rate = Rated(run)
     for seed in run.seeds:
         view = Conditioned(run.family, seed, TELLING, run.prior.model.preset.image_size)
         for method in (HMC, HMC_DELTA, *SWEEP):
@@ -37,7 +37,7 @@ def measure_sweep(run: Run) -> None:
 
 def measure_others(run: Run, folder: Path, rivals: Sequence[TrainedRival]) -> None:
     """Others' cars (`scenes.road_meshes`), seen as the family's are, by HMC with delta and without, and by rivals."""
-    rate = Rated(run.family, run.quick)
+    rate = Rated(run)
     for index, name in enumerate(MODELS[: run.count]):
         subject = read_road_mesh(folder, name)
         family = replace(run.family, draw=partial(_always, subject))

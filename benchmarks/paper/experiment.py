@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from benchmarks.harness.intervals import Figures, gap_rows, mean_rows
 from benchmarks.harness.results import Line, Results
@@ -29,6 +30,7 @@ class Run:
     effort: Effort
     seed: int = 0
     quick: bool = False
+    folder: Path | None = None  # for what is found once and serves several runs
 
     @property
     def seeds(self) -> range:

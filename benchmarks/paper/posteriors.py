@@ -2,6 +2,9 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+from jaxtyping import Float
+
 from benchmarks.harness.intervals import Figures
 from benchmarks.harness.progress import say
 from benchmarks.harness.results import Line
@@ -9,30 +12,38 @@ from benchmarks.harness.rows import Row
 from benchmarks.harness.tables import Table
 from benchmarks.paper.conditioned import PLACES, Conditioned, base_rate
 from benchmarks.paper.experiment import Run, answer_table
-from benchmarks.paper.families import Family
 from benchmarks.paper.judged import judge, picture_values
 from benchmarks.paper.methods import METHODS, SWEEP, Method, Question
 from benchmarks.paper.rival_answers import TrainedRival, answered
+from foundation.whole_file import whole_file
 
 RATED = range(200)  # training seeds that the base rate is of
 
 
 class Rated:
-    """The base rate of a family's voxels, found when it is first asked for."""
+    """The base rate of a family's voxels: found when it is first asked for, some minutes, and kept in the run's folder.
 
-    def __init__(self, family: Family, quick: bool) -> None:
-        self._family, self._seeds, self._rate = family, RATED[:20] if quick else RATED, None
+    It is a share of `RATED` objects, so its file is named by their number.
+    """
 
-    def __call__(self):
+    def __init__(self, run: Run) -> None:
+        self._family, self._seeds = run.family, RATED[:20] if run.quick else RATED
+        self._file = None if run.folder is None else run.folder / f"base-rate-{run.family.name}-{len(self._seeds)}.npy"
+
+    def __call__(self) -> Float[np.ndarray, "g g g"]:
         """Share of the training objects that occupy each voxel."""
-        if self._rate is None:
-            self._rate = base_rate(self._family, self._seeds)
-        return self._rate
+        if self._file is not None and self._file.is_file():
+            return np.load(self._file)
+        rate = base_rate(self._family, self._seeds)
+        if self._file is not None:
+            with whole_file(self._file) as part, part.open("wb") as file:
+                np.save(file, rate)
+        return rate
 
 
 def measure(run: Run, methods: Sequence[Method], rivals: Sequence[TrainedRival]) -> None:
     """Answers of all methods and rivals to each object from each place. Rivals answer to whole pictures only."""
-    rate = Rated(run.family, run.quick)
+    rate = Rated(run)
     for seed in run.seeds:
         for place in PLACES[run.family.name]:
             view = Conditioned(run.family, seed, place, run.prior.model.preset.image_size)

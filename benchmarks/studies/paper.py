@@ -143,7 +143,8 @@ def main(options: Options) -> Summary:
 
     def measure() -> None:
         for family in families:
-            run = Run(family, priors[family.name], anew, options.count, options.effort, options.seed, options.quick)
+            effort = options.effort, options.seed, options.quick
+            run = Run(family, priors[family.name], anew, options.count, *effort, options.out)
             own = rivals.get(family.name, [])
             keep_training(run, own)
             if "gate" in wanted:
