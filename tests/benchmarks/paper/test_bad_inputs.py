@@ -71,7 +71,7 @@ def test_an_unknown_split_is_refused(tmp_path: Path) -> None:
         (pictures.main, pictures.Options(tmp_path / "set.npz", split="dev")),
     ):
         with pytest.raises(ValueError, match=r"^no split 'dev'; there are: train, val, test$"):
-            main(options)  # type: ignore[operator]
+            main(options)
     with pytest.raises(ValueError, match="0 objects were asked for"):
         families.seeds_of("val", 0)
     assert not list(tmp_path.iterdir())

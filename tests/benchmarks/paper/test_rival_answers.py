@@ -49,7 +49,7 @@ def test_those_without_weights_are_left_out_and_the_table_says_so(folder: Path, 
     assert [r.name for r in rivals] == ["functa", "nerf_vae", "pi_gan"]
     assert [r.answers for r in rivals] == [True, True, False]
     prior = Prior(ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {"family": "cars"}, "hash")
-    run = Run(CARS, prior, Results(tmp_path / "rows.jsonl"), 1, None)  # type: ignore[arg-type]
+    run = Run(CARS, prior, Results(tmp_path / "rows.jsonl"), 1, None)
     keep_training(run, rivals)
     keep_training(run, rivals)
     assert [line["method"] for line in run.results.lines] == ["ProbNeRF", "Functa", "NeRF-VAE", "pi-GAN"]
@@ -60,7 +60,7 @@ def test_those_without_weights_are_left_out_and_the_table_says_so(folder: Path, 
 
 def test_answers_are_pictures_and_only_draws_differ(folder: Path, view: Conditioned, tmp_path: Path) -> None:
     prior = Prior(ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {"family": "cars"}, "hash")
-    run = Run(CARS, prior, Results(tmp_path / "rows.jsonl"), 1, None)  # type: ignore[arg-type]
+    run = Run(CARS, prior, Results(tmp_path / "rows.jsonl"), 1, None)
     for rival in trained_rivals(folder, CARS)[:2]:
         given, held = answered(rival, view, 0)
         assert given.shape == (len(held), SIZE, SIZE, 3) and held.shape == (len(given), len(HELD_OUT), SIZE, SIZE, 3)
