@@ -28,7 +28,7 @@ from probnerf.rendering import foam
 from probnerf.types import Rays
 
 COST = "cost of a picture"
-REPEATS = 5
+REPEATS = 2
 BOX = (-0.7, -0.4, -0.8, 0.7, 0.4, 0.0)
 NAMED = {"nerf_vae": "NeRF-VAE", "functa": "Functa"}  # the latent enters at each point
 FUNCTA_PUBLISHED = 2 * 15 * 512 * 512  # operations of a point: 15 layers of 512 (the paper's section 2.1)

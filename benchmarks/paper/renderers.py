@@ -16,15 +16,15 @@ from benchmarks.harness.progress import say
 from benchmarks.harness.results import Line
 from benchmarks.harness.rows import Row
 from benchmarks.harness.tables import Table
-from benchmarks.measures.renderer_acceptance import FOAM, IMPORTANCE, ITERATIONS, QUADRATURE, Span, acceptance
+from benchmarks.measures.renderer_acceptance import FOAM, ITERATIONS, QUADRATURE, Span, acceptance
 from benchmarks.paper.conditioned import rays_of
 from benchmarks.paper.experiment import Run
 from probnerf.types import Rays
 
 RENDERERS = "acceptance by renderer"
-NAMES = (FOAM, QUADRATURE, IMPORTANCE)
+NAMES = (FOAM, QUADRATURE)
 STEPS = (0.0005, 0.002, 0.008, 0.03, 0.1)
-RAYS = 64  # pixels of the picture
+RAYS = 32  # pixels of the picture
 SPAN: Span = (0.2, 3.4)  # along the rays of a camera 1.7 from the car's middle
 
 
