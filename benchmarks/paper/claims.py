@@ -111,7 +111,8 @@ def claims(lines: Sequence[Line]) -> list[Claim]:
 
 
 def _samples(lines: Sequence[Line]) -> list[Claim]:
-    condition = condition_of("cars", max(COUNTS))
+    measured = {x["condition"] for x in lines}
+    condition = next((c for n in sorted(COUNTS, reverse=True) if (c := condition_of("cars", n)) in measured), "")
     value = {x["method"]: x["distance"] for x in lines if x["condition"] == condition}
     floor = value.get(OTHERS, float("nan"))
     found = []
