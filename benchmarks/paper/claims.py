@@ -17,9 +17,9 @@ from benchmarks.harness.tables import Table, ranged
 from benchmarks.measures.renderer_acceptance import FOAM, QUADRATURE
 from benchmarks.paper.annealing import by_chain
 from benchmarks.paper.conditioned import PLACES
-from benchmarks.paper.decoders import COST
+from benchmarks.paper.decoders import COST, DECODER
 from benchmarks.paper.methods import ENCODER, FIXED, HMC, HMC_DELTA, VI, VI_DELTA, Effort
-from benchmarks.paper.prior_samples import COUNTS, OTHERS, PAPER, condition_of
+from benchmarks.paper.prior_samples import COUNTS, OTHERS, PAPER, SAMPLES, condition_of
 from benchmarks.paper.renderers import by_step
 from benchmarks.paper.rival_answers import unhealthy
 from benchmarks.rivals.registry import RIVALS
@@ -113,7 +113,7 @@ def claims(lines: Sequence[Line]) -> list[Claim]:
 def _samples(lines: Sequence[Line]) -> list[Claim]:
     measured = {x["condition"] for x in lines}
     condition = next((c for n in sorted(COUNTS, reverse=True) if (c := condition_of("cars", n)) in measured), "")
-    value = {x["method"]: x["distance"] for x in lines if x["condition"] == condition}
+    value = {x["method"].removesuffix(SAMPLES): x["distance"] for x in lines if x["condition"] == condition}
     floor = value.get(OTHERS, float("nan"))
     found = []
     pairs = (("ProbNeRF", FUNCTA), ("Functa, diffusion", "ProbNeRF"), ("pi-GAN", "ProbNeRF"), ("pi-GAN", FUNCTA))
@@ -169,7 +169,9 @@ def _annealing(lines: Sequence[Line]) -> list[Claim]:
 def _cost(lines: Sequence[Line]) -> list[Claim]:
     text = "the hypernetwork's field is cheaper than one that is told the latent at each point (NeRF-VAE, own sizes)"
     said = "more than 100 times an evaluation, of Functa's 15 x 512"
-    ratios = [x["ratio"] for x in lines if x["condition"].endswith(COST) and x["method"] == "NeRF-VAE, own sizes"]
+    ratios = [
+        x["ratio"] for x in lines if x["condition"].endswith(COST) and x["method"] == f"NeRF-VAE, own sizes{DECODER}"
+    ]
     if not ratios:
         return [Claim(text, said, "", UNMEASURED)]
     i = paired_interval(ratios, np.ones(len(ratios)))

@@ -28,6 +28,7 @@ from probnerf.rendering import foam
 from probnerf.types import Rays
 
 COST = "cost of a picture"
+DECODER = ": decoder"  # after a method's name, which has other settings elsewhere
 REPEATS = 2
 BOX = (-0.7, -0.4, -0.8, 0.7, 0.4, 0.0)
 NAMED = {"nerf_vae": "NeRF-VAE", "functa": "Functa"}  # the latent enters at each point
@@ -51,7 +52,7 @@ def measure(run: Run, rivals: Sequence[TrainedRival]) -> None:
             points[title] = (SIZE * SIZE * rival.config.samples, point_operations(name, rival))
     condition = f"{run.family.name}, {COST}"
     for repeat in range(run.count):
-        wanted = {name: run.missing(name, {}, condition, repeat) for name in shown}
+        wanted = {name: run.missing(f"{name}{DECODER}", {}, condition, repeat) for name in shown}
         if all(line is None for line in wanted.values()):
             continue
         seconds = median_seconds(shown, 1 if run.quick else REPEATS)
@@ -103,7 +104,8 @@ def tables(lines: Sequence[Line], rows: list[Row]) -> list[Table]:
         rows += mean_rows("paper", name, COST, "ratio", [x["ratio"] for x in mine], "")
         speed = np.mean([x["pixels_per_s"] for x in mine])
         each = f"{mine[0]['points'] / SIZE**2:.0f}", f"{mine[0]['operations']:,}"
-        cells.append([name, str(len(mine)), f"{speed:,.0f}", ranged(interval([x["ratio"] for x in mine]), 2), *each])
+        shown = name.removesuffix(DECODER)
+        cells.append([shown, str(len(mine)), f"{speed:,.0f}", ranged(interval([x["ratio"] for x in mine]), 2), *each])
     if cells:
         cells.append(["Functa, published", "", "", "", "", f"{FUNCTA_PUBLISHED:,} (counted)"])
     header = ("decoder", "n", "pixels a second", "time, ProbNeRF's = 1", "points a pixel", "operations a point")

@@ -30,6 +30,7 @@ from benchmarks.rivals.model import DiffusionGenerator, Generator
 from probnerf.inference import likelihood_settings
 
 COUNTS = (64, 256)  # pictures of each method
+SAMPLES = ": samples"  # after a method's name: of a name, the last settings alone count (`harness.results.newest`)
 OTHERS = "true pictures of other cars"
 PAPER = {"ProbNeRF": 84.6, "Functa": 158.1, "Functa, diffusion": 80.3, "pi-GAN": 36.7}  # Inception FID, SRN Cars
 Pictures = Callable[[int, Float[np.ndarray, "n 4 4"]], Float[np.ndarray, "n s s 3"]]
@@ -70,7 +71,7 @@ def measure(run: Run, rivals: Sequence[TrainedRival], features: FeatureFile, cou
         truth = None
         for name, (weights, made) in samplers.items():
             settings = {**weights, "features": features.name}
-            if (line := run.missing(name, settings, condition_of(run.family.name, n), 0)) is None:
+            if (line := run.missing(f"{name}{SAMPLES}", settings, condition_of(run.family.name, n), 0)) is None:
                 continue
             if truth is None:
                 truth = features_of(features.model, _true(run, 0)(n, T))
@@ -116,9 +117,9 @@ def tables(lines: Sequence[Line], rows: list[Row]) -> list[Table]:
     own = [line for line in lines if ", prior samples, n " in line["condition"]]
     for family in dict.fromkeys(line["condition"].split(",")[0] for line in own):
         columns = [condition_of(family, n) for n in COUNTS]
-        value = {(x["method"], x["condition"]): x["distance"] for x in own}
+        value = {(x["method"].removesuffix(SAMPLES), x["condition"]): x["distance"] for x in own}
         names = dict.fromkeys(line["settings"]["features"] for line in own)
-        methods = [m for m in dict.fromkeys(x["method"] for x in own) if any((m, c) in value for c in columns)]
+        methods = list(dict.fromkeys(name for name, c in value if c in columns))
         cells = []
         for method in methods:
             for n, condition in zip(COUNTS, columns, strict=True):

@@ -6,13 +6,14 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks.harness.results import Results
+from benchmarks.harness.results import Results, newest
 from benchmarks.measures.frechet import frechet_distance
 from benchmarks.paper import decoders, deltas, prior_samples, renderers
 from benchmarks.paper.conditioned import PLACES
 from benchmarks.paper.experiment import Run
 from benchmarks.paper.families import CARS
 from benchmarks.paper.methods import HMC, HMC_DELTA, SWEEP, Effort, Question
+from benchmarks.paper.rival_answers import keep_training
 from benchmarks.rivals.features import Features, FeatureSizes, features_of
 from probnerf.prior.checkpoint import Prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
@@ -32,7 +33,8 @@ def test_prior_samples_have_a_distance_in_named_features(run: Run, monkeypatch: 
     features = prior_samples.FeatureFile(model, "mine 1234")
     for _ in range(2):  # the second time nothing is made
         prior_samples.measure(run, [], features, (3,))
-    assert [line["method"] for line in run.results.lines] == ["ProbNeRF", prior_samples.OTHERS]
+    names = ["ProbNeRF", prior_samples.OTHERS]
+    assert [line["method"] for line in run.results.lines] == [f"{name}{prior_samples.SAMPLES}" for name in names]
     (table,) = prior_samples.tables(run.results.lines, [])
     assert "mine 1234" in table.title and table.header[1] == "n 3"
     assert table.lines[0][0] == "ProbNeRF" and table.lines[0][-1] == "84.6"
@@ -80,12 +82,14 @@ def test_decoders_are_timed_in_one_run(run: Run, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(decoders, "median_seconds", timed)
     decoders.measure(run, [])
     assert shown == list(seconds)
-    lines = {line["method"]: line for line in run.results.lines}
+    lines = {line["method"].removesuffix(decoders.DECODER): line for line in run.results.lines}
     assert lines["NeRF-VAE, own sizes"]["ratio"] == 4.0 and lines["ProbNeRF"]["ratio"] == 1.0
     assert lines["ProbNeRF"]["operations"] == 2 * run.prior.model.field.size
     assert lines["Functa, own sizes"]["operations"] > 2 * 5 * 256 * 256
     (table,) = decoders.tables(run.results.lines, [])
     assert table.lines[-1][0] == "Functa, published"
+    keep_training(run, [])  # the same model with other settings: no row hides another
+    assert newest(run.results.lines, run.prior.identity) == run.results.lines
 
 
 def test_a_scale_of_delta_is_another_method_and_delta_moves_by_it(run: Run) -> None:
