@@ -140,15 +140,17 @@ def _renderers(lines: Sequence[Line]) -> list[Claim]:
             found.append(Claim(text, said, "", UNMEASURED))
             continue
         step = min(steps)
-        value = float(np.mean(steps[step]))
+        value, n = float(np.mean(steps[step])), len(steps[step])
         right = value > HIGH if name == FOAM else value < LOW
         if not right and LOW <= value <= HIGH:
             words = f"{CAVEAT}: neither high nor low"
+        elif right and name == QUADRATURE:
+            words = f"{CAVEAT}: one prior for both renderers"
         elif right:
-            words = f"{CAVEAT}: one prior for both renderers" if name == QUADRATURE else REPRODUCED
+            words = REPRODUCED if n > 1 else f"{CAVEAT}: one draw of the prior"
         else:
             words = NOT
-        found.append(Claim(text, said, f"{value:.2f} at a step of {step:g}", words))
+        found.append(Claim(text, said, f"{value:.2f} at a step of {step:g}, n {n}", words))
     return found
 
 
