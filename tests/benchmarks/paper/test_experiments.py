@@ -113,3 +113,22 @@ def test_the_sweep_is_compared_on_the_same_objects() -> None:
     assert table.lines[0][:3] == ["0", "1", "10.0"] and table.lines[1][:3] == [f"{SWEEP[0].delta_scale:g}", "1", "12.0"]
     assert table.lines[1][3].startswith("+2.0")
     assert deltas.tables(lines[:2], [], range(2)) == []
+
+
+def test_others_cars_are_seen_as_the_family_s_are(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    car = CARS.draw(7)
+    asked: list[tuple[str, str, str | int]] = []
+
+    def answered(run, method, view, condition, thing, rate):
+        assert view.subject is car and view.given.mask.any()
+        np.testing.assert_array_equal(view.T_object_camera[0], CARS.camera(view.place.azimuth, view.place.elevation))
+        asked.append((method.name, condition, thing))
+
+    monkeypatch.setattr(deltas, "read_road_mesh", lambda folder, name: car)
+    monkeypatch.setattr(deltas, "keep_answer", answered)
+    deltas.measure_others(run, tmp_path, [])
+    assert asked == [
+        (method.name, f"other people's cars, {place.name}", "hatchback")
+        for place in PLACES["cars"]
+        for method in deltas.ON_OTHERS
+    ]
