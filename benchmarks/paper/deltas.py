@@ -64,13 +64,16 @@ def tables(lines: Sequence[Line], rows: list[Row], seeds: range) -> list[Table]:
             base = {x["object"]: x for x in own if x["method"] == HMC.name}
             swept = {x["object"] for x in own if x["method"] in [m.name for m in SWEEP]}
             both = [seed for seed in values if seed in base and seed in swept]
+            if not both:
+                continue
             shown = []
             for metric in ("psnr_given", "psnr_heldout"):
-                mean = float(np.mean([values[seed][metric] for seed in both])) if both else float("nan")
+                mean = float(np.mean([values[seed][metric] for seed in both]))
                 pair = ([x[seed][metric] for seed in both] for x in (values, base))
                 rows += gap_rows("paper", method, "sweep of delta", f"{metric}_above_0", *pair, unit="dB")
                 gap = Figures(rows).interval("sweep of delta", method, f"{metric}_above_0")
-                shown += [f"{mean:.1f}", "" if scale == 0 else ranged(gap, 1, "+")]
+                above = ranged(gap, 1, "+") if gap.n > 1 else f"{gap.mean:+.1f}"
+                shown += [f"{mean:.1f}", "" if scale == 0 else above]
             cells.append([f"{scale:g}", str(len(both)), *shown])
         header = ("sqrt(alpha)", "n", "psnr_given", "above 0's", "psnr_heldout", "above 0's")
         found.append(Table(f"{INFORMATIVE}: HMC with delta of scale sqrt(alpha), dB", header, cells))
