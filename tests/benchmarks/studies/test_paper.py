@@ -122,7 +122,7 @@ def test_rows_are_kept_and_summed_up(tmp_path: Path, model: ProbNeRF, monkeypatc
     values = {"psnr_given": 20.0, "psnr_heldout": 10.0, "psnr_heldout_of_mean": 11.0, "pixel_sd": 0.1}
     values |= {"hidden_nll": 0.3, "hidden_ece": 0.05}
     monkeypatch.setattr(posteriors, "judge", lambda *_: SimpleNamespace(values=values))
-    monkeypatch.setattr(posteriors, "base_rate", lambda *_: None)
+    monkeypatch.setattr(posteriors, "base_rate", lambda *_: np.zeros((2, 2, 2)))
     monkeypatch.setattr(gate, "refit", lambda *_: SimpleNamespace(iou=0.9))
     tints = np.linspace(0.0, 1.0, 8)[:, None, None, None, None]
     monkeypatch.setattr(annealing, "pictures", lambda *_: np.broadcast_to(tints, (8, 1, SIZE, SIZE, 3)))
@@ -139,14 +139,16 @@ def test_rows_are_kept_and_summed_up(tmp_path: Path, model: ProbNeRF, monkeypatc
     options: dict[str, Any] = {
         "quick": True,
         "rivals": tmp_path,
+        "experiments": "gate;posteriors;annealing",
         "families": "cars;bodies",
         "results": tmp_path / "kept.jsonl",
     }
     found = main(Options(tmp_path, **options))
     assert asked == ["hmc", "the prior alone"] * 2
     titles = [t.title for t in found.tables]
-    assert titles[0] == "z~ fitted to the solid" and titles[2:4] == ["cars, back", "cars, three-quarter view"]
-    assert "0.900" in found.tables[0].lines[0][2] and found.tables[0].lines[0][2].endswith("pass")
+    assert titles[0].startswith("The paper's claims") and titles[2] == "z~ fitted to the solid"
+    assert titles[4:6] == ["cars, back", "cars, three-quarter view"]
+    assert "0.900" in found.tables[2].lines[0][2] and found.tables[2].lines[0][2].endswith("pass")
     value = {(r.condition, r.method, r.metric): r.value for r in found.rows}
     assert value["cars, back", "the prior alone", "hidden_nll_above_hmc"] == 0.0
     assert value[ANNEALING, "hmc", "psnr_given, best"] > value[ANNEALING, "hmc", "psnr_given, worst"]
