@@ -54,5 +54,7 @@ def between(i: PairedInterval, digits: int = 3, sign: str = "") -> str:
 
 
 def ranged(i: PairedInterval, digits: int = 3, sign: str = "") -> str:
-    """A mean and the ends of its interval."""
+    """A mean and the ends of its interval; one value has none."""
+    if i.n == 1:
+        return f"{i.mean:{sign}.{digits}f}"
     return f"{i.mean:{sign}.{digits}f} ({between(i, digits, sign)})"
