@@ -81,6 +81,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
         "probnerf/sampling/*",
         "probnerf/training/elbo.py",
         "probnerf/training/posterior_flow.py",
+        "benchmarks/household/flow.py",
         "benchmarks/rivals/*",
     ),
     "safetensors": ("probnerf/prior/checkpoint.py", "benchmarks/rivals/model.py"),

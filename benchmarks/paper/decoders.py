@@ -41,18 +41,20 @@ def measure(run: Run, rivals: Sequence[TrainedRival]) -> None:
     origins, directions = (jnp.asarray(a, jnp.float32) for a in rays_of(T[0]))
     rays = Rays(jnp.broadcast_to(origins, directions.shape), directions)
     shown = {"ProbNeRF": (lambda z: _own(model, z, rays), jnp.zeros(model.latent))}
+    weights: dict[str, Line] = {}  # of trained rivals
     points = {"ProbNeRF": (SIZE * SIZE * LATTICE.crossings, own_operations(model))}
     for name, label in NAMED.items():
         entry = RIVALS[name]
         config = entry.config(box=BOX, tan_half_fov=0.5)
         models = {f"{label}, own sizes": entry.model(config, jax.random.key(0))}
         models |= {f"{label}, as trained": r.model for r in rivals if r.name == name}
+        weights |= {f"{label}, as trained": {"weights": r.digest} for r in rivals if r.name == name}
         for title, rival in models.items():
             shown[title] = _rendering(rival, jnp.asarray(T, jnp.float32))
             points[title] = (SIZE * SIZE * rival.config.samples, point_operations(name, rival))
     condition = f"{run.family.name}, {COST}"
     for repeat in range(run.count):
-        wanted = {name: run.missing(f"{name}{DECODER}", {}, condition, repeat) for name in shown}
+        wanted = {name: run.missing(f"{name}{DECODER}", weights.get(name, {}), condition, repeat) for name in shown}
         if all(line is None for line in wanted.values()):
             continue
         seconds = median_seconds(shown, 1 if run.quick else REPEATS)

@@ -72,8 +72,7 @@ def tables(lines: Sequence[Line], rows: list[Row], seeds: range) -> list[Table]:
                 pair = ([x[seed][metric] for seed in both] for x in (values, base))
                 rows += gap_rows("paper", method, "sweep of delta", f"{metric}_above_0", *pair, unit="dB")
                 gap = Figures(rows).interval("sweep of delta", method, f"{metric}_above_0")
-                above = ranged(gap, 1, "+") if gap.n > 1 else f"{gap.mean:+.1f}"
-                shown += [f"{mean:.1f}", "" if scale == 0 else above]
+                shown += [f"{mean:.1f}", "" if scale == 0 else ranged(gap, 1, "+")]
             cells.append([f"{scale:g}", str(len(both)), *shown])
         header = ("sqrt(alpha)", "n", "psnr_given", "above 0's", "psnr_heldout", "above 0's")
         found.append(Table(f"{INFORMATIVE}: HMC with delta of scale sqrt(alpha), dB", header, cells))

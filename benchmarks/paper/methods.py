@@ -171,6 +171,3 @@ SWEEP = tuple(
 )
 OWN, ENCODER, PRIOR = Method("tempered smc", _own), Method("encoder alone", _encoder), Method("the prior alone", _prior)
 METHODS = (HMC, HMC_DELTA, VI, VI_DELTA, OWN, ENCODER, PRIOR)
-SWEEP = tuple(
-    Method(f"hmc, delta x {scale:g}", _hmc(True, delta_scale=scale), delta=True, delta_scale=scale) for scale in SWEPT
-)

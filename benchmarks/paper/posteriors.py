@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.harness.intervals import Figures
+from benchmarks.harness.machine import revision
 from benchmarks.harness.progress import say
 from benchmarks.harness.results import Line
 from benchmarks.harness.rows import Row
@@ -23,12 +24,16 @@ RATED = range(200)  # training seeds that the base rate is of
 class Rated:
     """The base rate of a family's voxels: found when it is first asked for, some minutes, and kept in the run's folder.
 
-    It is a share of `RATED` objects, so its file is named by their number.
+    Its file is named by the number of objects and the revision of the code that draws them.
     """
 
     def __init__(self, run: Run) -> None:
         self._family, self._seeds = run.family, RATED[:20] if run.quick else RATED
-        self._file = None if run.folder is None else run.folder / f"base-rate-{run.family.name}-{len(self._seeds)}.npy"
+        self._file = (
+            None
+            if run.folder is None
+            else run.folder / f"base-rate-{run.family.name}-{len(self._seeds)}-{revision()}.npy"
+        )
 
     def __call__(self) -> Float[np.ndarray, "g g g"]:
         """Share of the training objects that occupy each voxel."""

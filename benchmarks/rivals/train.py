@@ -187,8 +187,7 @@ def main(options: Options) -> Path:
     if options.model not in RIVALS:
         raise ValueError(f"there is no rival '{options.model}'; choose one of {', '.join(RIVALS)}")
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # others train beside it
-    run, entry = Run(options), RIVALS[options.model]
-    given = load_pictures(options.data)
+    entry, given = RIVALS[options.model], load_pictures(options.data)
     if given.rgb.shape[1] < 3:
         raise ValueError(f"{options.data} has {given.rgb.shape[1]} views of each object; 3 or more are examined")
     if options.model in ("pixel_nerf", "nerf_vae") and given.rgb.shape[2] % HALVED:
@@ -196,6 +195,7 @@ def main(options: Options) -> Path:
             f"{options.data} has pictures of {given.rgb.shape[2]} px; {options.model} halves them four times: draw them"
             f" with --size {-(-given.rgb.shape[2] // HALVED) * HALVED}"
         )
+    run = Run(options)
     learnt, new = split(given)
     objects, views, size = learnt.rgb.shape[:3]
     run.story |= {"family": str(given.family), "objects": objects, "views": views, "size": size}

@@ -7,8 +7,8 @@ Objects of the test seeds of `benchmarks.paper.families`, of known pose, each fr
 posterior inference (the paper's figure of ablations): HMC as in the paper and mean-field VI, each with the weights'
 perturbation delta and without, beside this project's sampler, the encoder alone and the prior alone; and the rivals
 whose weights are in benchmarks/checkpoints/paper/rivals: Functa (MAP), NeRF-VAE (draws of its encoder's answer) and
-pixelNeRF. They were trained by `python -m benchmarks.rivals.train`; a table says how long, and whether each is healthy
-alone. A point estimate has no pixel_sd, and what hidden space a rival fills is not measured.
+pixelNeRF. `python -m benchmarks.rivals.train` trains them; a table says which are there, how long they learnt, and
+whether each is healthy alone. A point estimate has no pixel_sd, and what hidden space a rival fills is not measured.
 
 - psnr_given, psnr_heldout: of an answer's pictures from the given place (of what was given) and from four others, dB, a
   mean over draws; psnr_heldout_of_mean: of the mean picture.

@@ -5,9 +5,7 @@ records every frame and publishes it on the bus. This thread infers from the new
 """
 
 import math
-import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 
@@ -15,6 +13,7 @@ from rich.console import Console
 
 from calibration.camera_file import read_camera
 from calibration.pose_files import read_mounting
+from node.commands.keeper import Keeper
 from node.commands.options import LiveConfig
 from node.ros.bus import Bus
 from node.ros.clock import Clock
@@ -33,11 +32,12 @@ from perception.inference.scene import estimate_scene
 from perception.inference.schedule import config_hash, scheduled
 from perception.inference.tracker import Change, Look, Tracker
 from perception.inference.warm_up import warm_up
-from perception.observation.segmentation import NothingThere, Segment, segment
+from perception.observation.seen_surface import SeenSurface, is_gone, seen_surface
+from perception.observation.segmentation import Segment, segment
 from perception.sources.frame import Frame, Source
 from perception.sources.open_source import open_source
 from perception.sources.playback import Playback
-from perception.sources.reader import Listener, Reader
+from perception.sources.reader import Reader
 from perception.sources.recorder import Recorder
 from perception.sources.recording import Log
 from perception.sources.topic_names import TopicNames
@@ -46,7 +46,6 @@ from probnerf.types import StopReason
 
 HYPOTHESES_TOPIC = "/farside/hypotheses"
 STATUS_S = 1.0  # between diagnostics
-KEPT = 1000  # stamps of recorded frames that are remembered
 
 
 def live(config: LiveConfig, out: Console, err: Console) -> None:
@@ -73,7 +72,7 @@ def live(config: LiveConfig, out: Console, err: Console) -> None:
         clock = Clock(bus, config.bus.use_sim_time)
         announcer = Announcer(bus, config.planner, clock)
         reader = Reader(source)
-        keeper = _Keeper(
+        keeper = Keeper(
             reader.listen("keeper"),
             recorder,
             None if config.source == "topic" else announcer,
@@ -125,49 +124,6 @@ def _close(recorder: Recorder) -> None:
         recorder.path.unlink(missing_ok=True)
 
 
-class _Keeper:
-    """Takes every frame: to the recording and to who listens on the bus."""
-
-    def __init__(
-        self,
-        listener: Listener,
-        recorder: Recorder | None,
-        announcer: Announcer | None,
-        trouble: Callable[[str], object],
-    ) -> None:
-        self.thread = threading.Thread(target=self._run, name="farside keeper", daemon=True)
-        self._listener, self._recorder, self._announcer = listener, recorder, announcer
-        self._trouble = trouble
-        self._recorded: deque[int] = deque(maxlen=KEPT)
-
-    def has(self, frame: Frame) -> bool:
-        """The recording has this frame, or there is no recording."""
-        return self._recorder is None or self._recorder.error is not None or frame.stamp_ns in self._recorded
-
-    def close(self) -> None:
-        """Wait until all that came is handed on."""
-        if self.thread.ident is not None:
-            self.thread.join(10.0)
-
-    def _run(self) -> None:
-        while True:
-            try:
-                frame = self._listener.take(0.5)
-            except Exception:  # the main thread reports the source's end
-                return
-            if frame is None:
-                if self._listener.ended:
-                    return
-                continue
-            try:
-                if self._recorder is not None and self._recorder.write_frame(frame):
-                    self._recorded.append(frame.stamp_ns)
-                if self._announcer is not None:
-                    self._announcer.frame(frame)
-            except ValueError as error:  # one frame that no message can hold must not end all
-                self._trouble(str(error))
-
-
 class LiveNode:
     """Infers from the newest frame and publishes the results."""
 
@@ -178,7 +134,7 @@ class LiveNode:
         announcer: Announcer,
         answers: Answers,
         reader: Reader,
-        keeper: _Keeper,
+        keeper: Keeper,
         recorder: Recorder | None,
         err: Console,
     ) -> None:
@@ -189,6 +145,7 @@ class LiveNode:
         self.placed: str | None = None  # frame of the camera that --hand-eye places
         self.frames = self.inferences = self.answered = 0
         self._scene: dict[int, Hypotheses] = {}
+        self._surfaces: dict[int, SeenSurface] = {}  # of the scene's objects, when last seen
         self._said: dict[str, int] = {}  # what went wrong, and how often
         self._hash = config_hash(config.controller, config.segment, config.track)
         self._told = 0.0
@@ -229,10 +186,8 @@ class LiveNode:
         try:
             segments = segment(frame, None, self.config.segment)
         except ValueError as error:
-            if isinstance(error, NothingThere):  # what stood there is gone, which planners must hear
-                self._scene = {}
-                self._publish(frame, {})
-            return self._trouble(str(error))
+            self._trouble(str(error))
+            return self._take_away(frame)
         if segments.doubt:
             self._trouble(segments.doubt)
         for it in segments.left_out:
@@ -244,9 +199,12 @@ class LiveNode:
                     looks.append((found, look))
             except ValueError as error:
                 self._trouble(f"object {found.id}: {error}")
+        if not looks:
+            return self._take_away(frame)
         ids = {look.object_id: found for found, look in looks}
+        self._surfaces = {look.object_id: seen_surface(frame, found.mask) for found, look in looks}
         self._scene = {look.object_id: look.hypotheses for _, look in looks if look.hypotheses is not None}
-        if self._scene or not looks:
+        if self._scene:
             self._publish(frame, ids)
         for _, look in looks:
             if look.settled:
@@ -286,6 +244,13 @@ class LiveNode:
             interrupted |= h.result == StopReason.INTERRUPTED
         if interrupted:  # the sampler caught a Ctrl-C meant for the whole node
             raise KeyboardInterrupt
+
+    def _take_away(self, frame: Frame) -> None:
+        """Take from the scene what a picture of no object shows to be gone; one that shows nothing takes nothing."""
+        kept = {name: h for name, h in self._scene.items() if not is_gone(self._surfaces[name], frame)}
+        if len(kept) < len(self._scene):  # which planners must hear
+            self._scene = kept
+            self._publish(frame, {})
 
     def _publish(self, frame: Frame, segments: dict[int, Segment]) -> None:
         objects = list(self._scene.values())

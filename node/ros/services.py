@@ -53,9 +53,9 @@ class Answers:
 
     @property
     def scene(self) -> Scene:
-        """The newest scene. Raises ValueError before the first."""
+        """The newest scene. Raises ValueError while there is none."""
         if (scene := self._scene) is None:
-            raise ValueError("there are no hypotheses yet; ask again when the node has seen an object")
+            raise ValueError("there are no hypotheses; ask again when the node has seen an object")
         return scene
 
     def serve(self, bus: Bus) -> None:

@@ -68,10 +68,6 @@ class Segments(Sequence[Segment]):
         return len(self.objects)
 
 
-class NothingThere(ValueError):
-    """The frame was seen, and no object stands in it."""
-
-
 def segment(frame: Frame, object_id: int | None = None, config: SegmentConfig | None = None) -> Segments:
     """The objects of a frame, or the one with `object_id`.
 
@@ -87,7 +83,7 @@ def segment(frame: Frame, object_id: int | None = None, config: SegmentConfig | 
     of the object. Pixels in no mask count as behind it.
 
     Raises `ValueError` if there is no plane, no such id, no object, a mask of a few pixels, or the principal point is
-    outside of the picture; of its kind `NothingThere` if nothing stands there to be an object.
+    outside of the picture.
     """
     config = config or SegmentConfig()
     try:
@@ -97,8 +93,7 @@ def segment(frame: Frame, object_id: int | None = None, config: SegmentConfig | 
             return Segments(tuple(_segment_colour(frame, object_id, config)))
         return _segment_depth(frame, object_id, config)
     except ValueError as error:
-        kind = NothingThere if isinstance(error, NothingThere) else ValueError
-        raise kind(f"frame at {frame.stamp_ns} ns: {error}") from None
+        raise ValueError(f"frame at {frame.stamp_ns} ns: {error}") from None
 
 
 def _check_camera(frame: Frame) -> None:
@@ -126,7 +121,7 @@ def _segment_depth(frame: Frame, object_id: int | None, config: SegmentConfig) -
     elif label is not None:
         ids = [int(i) for i in np.unique(label) if i > 0]
         if not 0 < len(ids) <= _MOST_OBJECTS:
-            raise (ValueError if ids else NothingThere)(
+            raise ValueError(
                 f"the label map names {len(ids) or 'no'} objects; give one with 1 to {_MOST_OBJECTS} ids above 0, or"
                 " none"
             )
@@ -137,7 +132,7 @@ def _segment_depth(frame: Frame, object_id: int | None, config: SegmentConfig) -
         found = {i: (thing.mask, thing.plane) for i, thing in enumerate(stands.things, start=1)}
         left = [LeftOut(i, *it) for i, it in enumerate(stands.left_out, start=len(found) + 1)]
         if not found:
-            raise (ValueError if left else NothingThere)(_nothing(left, frame.depth))
+            raise ValueError(_nothing(left, frame.depth))
     if object_id is not None and object_id not in found:
         why = [f"object {it.id} is left out: {it.reason}" for it in left if it.id == object_id]
         raise ValueError(*why or [f"no object {object_id}; its objects: {', '.join(map(str, found))}"])
@@ -220,7 +215,7 @@ def _segment_colour(frame: Frame, object_id: int | None, config: SegmentConfig) 
         ids = [1]
     if not ids or object_id not in (None, *ids):
         names = ", ".join(map(str, ids)) or "none"
-        raise (ValueError if ids else NothingThere)(f"no object {object_id or 'to infer'}; its objects: {names}")
+        raise ValueError(f"no object {object_id or 'to infer'}; its objects: {names}")
     ids = [i for i in ids if object_id in (None, i)]
     plane = supposed_plane(frame, config.guess)
     v, u = np.mgrid[: label.shape[0], : label.shape[1]]

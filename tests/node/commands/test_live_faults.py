@@ -16,7 +16,7 @@ import pytest
 
 from node.__main__ import main
 from node.commands.config_file import load_config
-from node.commands.live import _Keeper
+from node.commands.keeper import Keeper
 from node.commands.options import LiveConfig
 from node.viewer.page import Page
 from perception.inference.tracker import Tracker
@@ -93,7 +93,7 @@ def test_a_frame_that_cannot_be_recorded_does_not_end_the_recording(tmp_path: Pa
     said: list[str] = []
     reader = Reader(StillSource((bad, *others)))
     with Recorder(tmp_path / "a.mcap") as recorder:
-        keeper = _Keeper(reader.listen("keeper"), recorder, None, said.append)
+        keeper = Keeper(reader.listen("keeper"), recorder, None, said.append)
         with reader:
             keeper.thread.start()
             keeper.thread.join(10.0)
