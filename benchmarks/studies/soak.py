@@ -37,7 +37,8 @@ from benchmarks.harness.rows import Row
 from benchmarks.harness.study import Summary, TableOptions
 from benchmarks.scenes.recording import noisy
 from benchmarks.studies.bus import box_scene
-from node.commands.live import LiveNode, _close, _Keeper
+from node.commands.keeper import Keeper
+from node.commands.live import LiveNode, _close
 from node.commands.options import LiveConfig
 from node.ros.bus import Bus
 from node.ros.messages import QUERY_REGION, encode, header, make, type_hash
@@ -182,7 +183,7 @@ def node(record: str, how: str, seconds: float, seed: int) -> None:
             return True
 
         recorder.write_frame = write_frame  # type: ignore[method-assign]
-        keeper = _Keeper(reader.listen("keeper"), recorder, announcer, lambda _: None)
+        keeper = Keeper(reader.listen("keeper"), recorder, announcer, lambda _: None)
         stack.callback(keeper.close)
         stack.enter_context(reader)
         keeper.thread.start()
