@@ -46,7 +46,9 @@ class TopicSource:
         streams = tuple(filter(None, (c.depth, c.detections)))
         waiting = c.waiting if c.detections is None else _DETECTING * c.waiting
         self._matcher: StampMatcher[Any, Any] = StampMatcher(streams, round(c.tolerance_ms * 1e6), waiting, 2 * waiting)
-        self._matched: tuple[Any, dict[str, Any]] | None = None  # the newest colour, and its depth and detections
+        # the number of the newest pair, its colour, its depth and detections
+        self._matched: tuple[int, Any, dict[str, Any]] | None = None
+        self._order = self._made = 0  # numbers of the newest pair and of the newest that became a frame
         self._info: Any = None
         self._by_arrival = False  # some stream has no stamps
         self._boxes: dict[int, BoxPx] = {}  # of the last detections, by id
@@ -182,7 +184,8 @@ class TopicSource:
                     self.skipped += 1
                     continue
                 self.skipped += self._matched is not None and self._info is not None
-                self._matched = match.lead, match.partners
+                self._order += 1
+                self._matched = self._order, match.lead, match.partners
                 continue
             self.dropped += 1
             if (gap := match.gaps_ns[depth]) < float("inf"):
@@ -197,7 +200,7 @@ class TopicSource:
         with self._changed:
             if self._info is None or self._matched is None:
                 return
-            ((stamp, colour), partners), self._matched = self._matched, None
+            (order, (stamp, colour), partners), self._matched = self._matched, None
             info, c = self._info, self.config
         try:
             frame = self._frame(stamp, colour, None if c.depth is None else partners[c.depth], info)
@@ -211,9 +214,10 @@ class TopicSource:
         with self._changed:
             self._heard.clear()
             self._gaps.clear()
-            self.skipped += self._newest is not None
-            if self._newest is None or frame.stamp_ns > self._newest[0].stamp_ns:
-                self._newest = frame, boxes
+            late = order < self._made  # another thread was quicker with a newer one, which may be in use
+            self.skipped += late or self._newest is not None
+            if not late and (self._newest is None or frame.stamp_ns > self._newest[0].stamp_ns):
+                self._made, self._newest = order, (frame, boxes)
             self._changed.notify_all()
 
     def _frame(self, stamp: int, colour: Any, depth: Any, info: Any) -> Frame:

@@ -1,5 +1,6 @@
 """A camera driver's topics become Frames, exactly; what does not fit is left out and said."""
 
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -12,6 +13,7 @@ from node.ros.bus import Bus
 from node.ros.messages import header, make
 from node.ros.settings import BusConfig, TopicConfig
 from node.ros.topic_source import TopicSource
+from perception.sources.frame import Frame
 
 WIDTH, HEIGHT, MS = 32, 24, 1_000_000
 COLOUR, DEPTH, INFO = "/cam/color/image_raw", "/cam/depth/image_raw", "/cam/color/camera_info"
@@ -124,7 +126,35 @@ def test_only_the_newest_frame_waits(bus: Bus) -> None:
     for i in range(5):
         driver.say(i)
         wait_for(bus, i + 1)
-    assert next(iter(source)).stamp_ns == START + 4 * 33 * MS and source.skipped == 4
+    assert next(iter(source)).stamp_ns == START + 4 * 33 * MS
+    deadline = time.monotonic() + 20.0  # an older one may still be in the making
+    while source.skipped < 4 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert source.skipped == 4
+
+
+def test_an_older_frame_that_is_made_late_is_not_given_after_a_newer_one(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Colour and depth have threads of their own: one may be quicker with its frame."""
+    source, driver = TopicSource(bus, config(end_s=1.0)), Driver(bus)
+    made, hold, held = TopicSource._frame, threading.Event(), threading.Event()
+
+    def slow(self: TopicSource, stamp: int, *others: Any) -> Frame:
+        if stamp == START:
+            held.set()
+            assert hold.wait(20.0)
+        return made(self, stamp, *others)
+
+    monkeypatch.setattr(TopicSource, "_frame", slow)
+    driver.say_info()
+    driver.say(0)
+    assert held.wait(20.0)
+    with source._changed:  # what the other thread would do meanwhile
+        source._order += 1
+        source._made = source._order
+    hold.set()
+    assert list(source) == [] and source.skipped == 1
 
 
 @pytest.mark.parametrize("wrong", ["image", "info"])
