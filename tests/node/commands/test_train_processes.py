@@ -90,16 +90,16 @@ def test_two_processes_with_half_a_batch_each_make_the_steps_of_one(alone: Path,
 def test_a_killed_process_ends_the_other_and_the_run_goes_on(two: Path, tmp_path: Path, victim: int) -> None:
     shutil.copytree(two / "shapes", tmp_path / "shapes")
     processes, history = start_two(tmp_path), tmp_path / "history.jsonl"
-    try:
-        while not history.exists() or len(history.read_text().splitlines()) < 4:  # the ray phase is compiled now
-            assert all(process.poll() is None for process in processes)
-            time.sleep(0.05)
-        processes[victim].kill()
-        _, err = processes[1 - victim].communicate(timeout=600)
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
+    with processes[0], processes[1]:
+        try:
+            while not history.exists() or len(history.read_text().splitlines()) < 4:  # the ray phase is compiled now
+                assert all(process.poll() is None for process in processes)
+                time.sleep(0.05)
+            processes[victim].kill()
+            _, err = processes[1 - victim].communicate(timeout=600)
+        finally:
+            for process in processes:
+                process.kill()
     assert processes[1 - victim].returncode not in (0, -9)
     assert re.fullmatch(r"farside: error: .* is lost.*; start all processes again with .*", err.splitlines()[-1])
     assert not (tmp_path / "prior.safetensors").exists() and (tmp_path / "checkpoint.eqx").exists()
