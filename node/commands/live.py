@@ -32,7 +32,7 @@ from perception.inference.scene import estimate_scene
 from perception.inference.schedule import config_hash, scheduled
 from perception.inference.tracker import Change, Look, Tracker
 from perception.inference.warm_up import warm_up
-from perception.observation.seen_surface import SeenSurface, is_gone, seen_surface
+from perception.observation.seen_surface import is_gone
 from perception.observation.segmentation import Segment, segment
 from perception.sources.frame import Frame, Source
 from perception.sources.open_source import open_source
@@ -145,7 +145,7 @@ class LiveNode:
         self.placed: str | None = None  # frame of the camera that --hand-eye places
         self.frames = self.inferences = self.answered = 0
         self._scene: dict[int, Hypotheses] = {}
-        self._surfaces: dict[int, SeenSurface] = {}  # of the scene's objects, when last seen
+        self._seen: dict[int, tuple[Frame, Segment]] = {}  # the scene's objects, when last seen
         self._said: dict[str, int] = {}  # what went wrong, and how often
         self._hash = config_hash(config.controller, config.segment, config.track)
         self._told = 0.0
@@ -202,7 +202,7 @@ class LiveNode:
         if not looks:
             return self._take_away(frame)
         ids = {look.object_id: found for found, look in looks}
-        self._surfaces = {look.object_id: seen_surface(frame, found.mask) for found, look in looks}
+        self._seen = {name: (frame, found) for name, found in ids.items()}
         self._scene = {look.object_id: look.hypotheses for _, look in looks if look.hypotheses is not None}
         if self._scene:
             self._publish(frame, ids)
@@ -247,7 +247,8 @@ class LiveNode:
 
     def _take_away(self, frame: Frame) -> None:
         """Take from the scene what a picture of no object shows to be gone; one that shows nothing takes nothing."""
-        kept = {name: h for name, h in self._scene.items() if not is_gone(self._surfaces[name], frame)}
+        seen = ((name, *self._seen[name]) for name in self._scene)
+        kept = {name: self._scene[name] for name, before, it in seen if not is_gone(before, it.mask, frame)}
         if len(kept) < len(self._scene):  # which planners must hear
             self._scene = kept
             self._publish(frame, {})

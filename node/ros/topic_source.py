@@ -153,7 +153,7 @@ class TopicSource:
 
     def _labelled(self, frame: Frame, boxes: list[BoxPx] | None) -> Frame | None:
         """The frame with the things in the boxes as its label map; None: nothing is to be seen in them. Without a box
-        the map names nothing: all is gone.
+        the map names nothing.
         """
         if boxes is None:
             return frame
