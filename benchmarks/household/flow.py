@@ -1,9 +1,9 @@
 """Fit a prior's flow to objects that its other parts did not learn: `python -m benchmarks.household.flow`.
 
 A flow that is trained with its decoder knows the latents of its training objects. Others lie outside of its law: the
-mean square of their z~ is more than the 1 that it should be, so a posterior holds back from them. Here the decoder and the
-recognition stay as they are, and the flow climbs the likelihood of what recognition tells of fresh objects. The weights
-that are best on held-out ones of them are kept.
+mean square of their z~ is above 1, so a posterior holds back from them. Here the decoder and the recognition stay as
+they are, and the flow climbs the likelihood of what recognition tells of fresh objects. The weights that are best on
+held-out ones of them are kept.
 """
 
 from dataclasses import dataclass
