@@ -187,9 +187,14 @@ class Hypotheses:
 
         The coordinates broadcast, so that a lattice is three axes. Raises as `T_object_from`.
         """
+        return voxel_index(self.to_cube(frame, x, y, z), self.grid)
+
+    def to_cube(
+        self, frame: FrameName, x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."], z: Float[np.ndarray, "..."]
+    ) -> Float[np.ndarray, "... 3"]:
+        """Points (metres in `frame`) in cube units of the object frame. They broadcast; raises as `T_object_from`."""
         T = self.T_object_from(frame)[:3] / self.object_frame.half_extent
-        cube = np.stack([a * x + b * y + (c * z + d) for a, b, c, d in T])
-        return voxel_index(np.moveaxis(cube, 0, -1), self.grid)
+        return np.moveaxis(np.stack([a * x + b * y + (c * z + d) for a, b, c, d in T]), 0, -1)
 
 
 def binary_entropy(p: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:

@@ -7,12 +7,13 @@ of each, and the probability that a region is free of all is the product over *o
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import map_coordinates
 
 from perception.answers.hypotheses import FrameName, Hypotheses, binary_entropy
 from perception.answers.regions import Cells, Points, Region, Swept
@@ -50,7 +51,7 @@ class QueryResult:
     # by object id: which of its hypotheses (rows of its file) have something in the region, where some have: those
     # disagree with the rest
     blocked_by: dict[int, list[int]] = field(default_factory=dict)
-    p_occupied: list[float] | None = None  # of each point; None for a box
+    p_occupied: list[float] | None = None  # of each point, between voxels' centres; None for a box
     p_occupied_few: list[float] | None = None  # the same by the rule of succession, in unseen space
 
     def verdict(self, risk: float = 0.05) -> Verdict:
@@ -134,8 +135,8 @@ def query(scene: Sequence[Hypotheses], region: Region, frame: FrameName, now_ns:
         effective_hypotheses=min(h.effective_hypotheses for h in touched or scene),
         age_s=((time.time_ns() if now_ns is None else now_ns) - min(h.stamp_ns for h in scene)) * 1e-9,
         blocked_by=blocked_by,
-        p_occupied=None if points is None else _p_occupied(scene, points, frame, marginal),
-        p_occupied_few=None if points is None else _p_occupied(scene, points, frame, _marginal_few),
+        p_occupied=None if points is None else _p_occupied(scene, points, frame),
+        p_occupied_few=None if points is None else _p_occupied(scene, points, frame, few=True),
     )
 
 
@@ -156,12 +157,6 @@ def marginal(h: Hypotheses) -> Float[np.ndarray, "V"]:
     """p_occupied of each of the G^3 voxels, cautious where the object is out of model."""
     p = h.p_occupied.ravel()
     return (1 - CAUTION) * p + CAUTION * h.unseen.ravel() if h.out_of_model else p
-
-
-def _marginal_few(h: Hypotheses) -> Float[np.ndarray, "V"]:
-    """`marginal`, by the rule of succession in unseen space. What was seen free is so in every hypothesis."""
-    p = marginal(h)
-    return np.where(h.unseen.ravel(), _succession(p, h), p)
 
 
 def _succession(p: Float[np.ndarray, "..."] | np.floating, h: Hypotheses) -> Float[np.ndarray, "..."]:
@@ -288,15 +283,29 @@ def _sampled(region: Swept, width: float) -> tuple[Float[np.ndarray, "3 n"], Flo
     return np.concatenate(points, axis=1), np.concatenate(shares)
 
 
-def _p_occupied(
-    scene: Sequence[Hypotheses], region: Points, frame: FrameName, of: Callable[[Hypotheses], np.ndarray]
-) -> list[float]:
-    """1 - prod over objects of (1 - p) at each point."""
+def _p_occupied(scene: Sequence[Hypotheses], region: Points, frame: FrameName, few: bool = False) -> list[float]:
+    """1 - prod over objects of (1 - p) at each point; with `few`, p of unseen points by the rule of succession."""
     free = np.ones(len(region.points))
     for h in scene:
-        index = h.voxels(frame, *region.points.T)
-        free *= np.where(index >= 0, 1.0 - of(h)[index], 1.0)
+        free *= 1.0 - _at_points(h, region.points, frame, few)
     return (1.0 - free).tolist()
+
+
+def _at_points(h: Hypotheses, points: Float[np.ndarray, "n 3"], frame: FrameName, few: bool) -> Float[np.ndarray, "n"]:
+    """One object's p at points; 0 outside its cube.
+
+    Seen space is told voxel by voxel. In unseen space p is linear between the centres of voxels, for a shape's wall is
+    known no better than to a voxel, and in the lowest half voxel it falls towards the table, which is not the object's.
+    """
+    index = h.voxels(frame, *points.T)
+    inside = index >= 0
+    unseen = inside & h.unseen.ravel()[index]
+    p = np.where(inside, h.p_occupied.ravel()[index], 0.0)
+    places = (h.to_cube(frame, *points[unseen].T) + 1.0) * (0.5 * h.grid) - 0.5
+    p[unseen] = map_coordinates(h.p_occupied, places.T, order=1, mode="nearest")
+    if h.out_of_model:
+        p = (1 - CAUTION) * p + CAUTION * unseen
+    return np.where(unseen, _succession(p, h), p) if few else p
 
 
 def _volume_quantiles(objects: list[tuple[Float[np.ndarray, "S"], Float[np.ndarray, "S"]]]) -> dict[str, float]:

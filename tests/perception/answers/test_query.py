@@ -92,6 +92,17 @@ def test_few_hypotheses_support_no_certainty_about_an_unseen_point(mug):
     assert query([mug], Box(*LEFT), "object").p_occupied_few is None
 
 
+def test_between_centres_an_unseen_point_is_linear_and_a_seen_one_is_its_voxel(mug):
+    """Across the handle's outer wall (x = 0.10, p = 0.3) at y > 0; at y < 0 it was seen; below the table is nothing."""
+    x = 0.10 + VOXEL * np.array([-0.5, -0.25, 0.0, 0.25, 0.5])
+    unseen, seen = (query([mug], Points(np.stack([x, 0 * x + y, 0 * x], axis=-1)), "object") for y in (0.005, -0.005))
+    assert unseen.p_occupied == pytest.approx(0.3 * np.array([1.0, 0.75, 0.5, 0.25, 0.0]))
+    assert seen.p_occupied == pytest.approx([0.3, 0.3, 0.0, 0.0, 0.0])
+    standing = _object([_fill(((-0.04, -0.04, -0.16), (0.04, 0.04, 0.0)))], [1.0])
+    at_table = query([standing], Points(np.array([[0.0, 0.02, -0.12 + k * VOXEL] for k in (0.25, 0.5)])), "object")
+    assert at_table.p_occupied == pytest.approx([0.75, 1.0])
+
+
 def test_volumes_are_exact_where_the_box_follows_voxels(mug):
     left = query([mug], Box(*LEFT), "object").volume_m3
     assert left == {"q05": 0.0, "q50": 0.0, "q95": pytest.approx(HANDLE_M3)}
