@@ -95,8 +95,9 @@ class Camera:
             px = cv2.projectPoints(xyz.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), self.K, self.distortion)[0]
             px = np.asarray(px, dtype=np.float64).reshape(-1, 2)
         else:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                px = (xyz @ self.K.T)[:, :2] / xyz[:, 2:]
+            x, y, z = xyz.T
+            with np.errstate(divide="ignore", invalid="ignore"):  # row by row: BLAS gains nothing on so small a matrix
+                px = np.stack([(a * x + b * y + c * z) / z for a, b, c in self.K[:2]], axis=-1)
         px[~(xyz[:, 2] > 0)] = np.nan
         return px
 

@@ -140,7 +140,7 @@ def _segment_depth(frame: Frame, object_id: int | None, config: SegmentConfig) -
     alike = dict.fromkeys(found, np.zeros_like(seen))
     if label is None:
         alike = dict(zip(found, by_colour(frame.rgb, [mask for mask, _ in found.values()], seen), strict=True))
-    segments = []
+    segments, distance = [], np.sqrt(np.einsum("...i,...i", points, points))  # for all objects, once
     for i, (mask, plane) in found.items():
         if object_id not in (None, i):
             continue
@@ -148,7 +148,7 @@ def _segment_depth(frame: Frame, object_id: int | None, config: SegmentConfig) -
         if measured >= config.min_pixels:
             own = _own_plane(points, plane, mask, config)
             whole = mask | alike[i]
-            segments.append(Segment(i, whole, own, *_statuses(points, own, whole, label, alike[i], config)))
+            segments.append(Segment(i, whole, own, *_statuses(points, distance, own, whole, label, alike[i], config)))
             continue
         reason = f"{pixels} pixels, {measured} of them with depth; at least {config.min_pixels} are needed"
         if i == object_id or len(found) == 1:
@@ -260,8 +260,12 @@ def _may_stand_before(
 
 def _around(mask: Bool[np.ndarray, "h w"], width: int) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """A mask grown, and shrunk, by `width` px; the picture's border is no outline."""
-    grown = ndimage.binary_dilation(mask, _SQUARE, iterations=width)
-    return grown, ndimage.binary_erosion(mask, _SQUARE, iterations=width, border_value=1)
+    grown, core = np.zeros_like(mask), np.zeros_like(mask)
+    for place in ndimage.find_objects(mask.astype(np.uint8)):  # its box: the rest of the picture stays as it is
+        box = tuple(slice(max(side.start - width - 1, 0), side.stop + width + 1) for side in place)
+        grown[box] = ndimage.binary_dilation(mask[box], _SQUARE, iterations=width)
+        core[box] = ndimage.binary_erosion(mask[box], _SQUARE, iterations=width, border_value=1)
+    return grown, core
 
 
 @lru_cache(maxsize=2)  # every object of a frame asks
@@ -304,6 +308,7 @@ def _own_plane(
 
 def _statuses(
     points: Float[np.ndarray, "h w 3"],
+    distance: Float[np.ndarray, "h w"],
     plane: Float[np.ndarray, "4"],
     mask: Bool[np.ndarray, "h w"],
     label: Int[np.ndarray, "h w"] | None,
@@ -314,7 +319,7 @@ def _statuses(
 
     `alike`: the mask's pixels without depth that are the object's by their colour.
     """
-    distance, height = np.linalg.norm(points, axis=-1), heights(points, plane) / noise_growth(points)
+    height = heights(points, plane) / noise_growth(points)
     measured = np.isfinite(distance)
     body = points[mask & measured & (height > config.base)]
     if not len(body):

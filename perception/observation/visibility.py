@@ -65,7 +65,7 @@ def _behind_the_end(
     points, pixels, inside = _voxels(frame.camera, cube, grid)
     depth = plane_depth(frame.camera, cube.plane, segment.status) if frame.depth is None else frame.depth
     z = depth[pixels[:, 1], pixels[:, 0]]
-    distance = np.linalg.norm(points, axis=1)
+    distance = np.sqrt(np.einsum("ij,ij->i", points, points))
     with np.errstate(invalid="ignore"):
         behind = np.where(inside, distance * (1.0 - z / points[:, 2]), np.nan)
     behind = behind.reshape(grid, grid, grid)
@@ -82,8 +82,12 @@ def _voxels(
     camera: Camera, cube: ObjectFrame, grid: int
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
     """Voxel centres in the camera frame (m), the pixel each falls in (clipped), and whether that is in the picture."""
-    ticks = -1.0 + (np.arange(grid) + 0.5) * 2.0 / grid
-    points = cube.to_camera(np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3))
+    # sums along axes: a product of so small a matrix takes longer, and its threads wait for each other on a busy machine
+    ticks = (-1.0 + (np.arange(grid) + 0.5) * 2.0 / grid) * cube.half_extent
+    lattice = np.empty((grid, grid, grid, 3))
+    for axis, (a, b, c, d) in enumerate(cube.T_camera_object[:3]):
+        lattice[..., axis] = (a * ticks[:, None] + b * ticks)[:, :, None] + (c * ticks + d)
+    points = lattice.reshape(-1, 3)
     px = np.round(np.nan_to_num(camera.project(points), nan=-1.0))
     size = np.array([camera.width, camera.height])
     inside = ((px >= 0) & (px < size)).all(axis=1)
