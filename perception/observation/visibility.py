@@ -82,7 +82,7 @@ def _voxels(
     camera: Camera, cube: ObjectFrame, grid: int
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
     """Voxel centres in the camera frame (m), the pixel each falls in (clipped), and whether that is in the picture."""
-    # sums along axes: a product of so small a matrix takes longer, and its threads wait for each other on a busy machine
+    # sums along axes: a product of so small a matrix takes longer, and its threads wait for each other on busy cores
     ticks = (-1.0 + (np.arange(grid) + 0.5) * 2.0 / grid) * cube.half_extent
     lattice = np.empty((grid, grid, grid, 3))
     for axis, (a, b, c, d) in enumerate(cube.T_camera_object[:3]):
