@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy import ndimage
 
 from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
@@ -196,8 +197,8 @@ def _mixed(
 
 
 def _with_surface(h: Hypotheses, surface: Bool[np.ndarray, "G G G"]) -> Hypotheses:
-    """With what the camera measured of the object in every shape: where a shape has nothing within a voxel of it, the
-    measured surface's own voxel is made solid.
+    """With what the camera measured of the object in every shape: where a shape has no wall in a voxel of the measured
+    surface, nor in one that shares a face with it, that voxel is made solid.
 
     So a part in plain sight that the prior cannot make is in every hypothesis; what is behind it is each shape's own.
     """
@@ -206,7 +207,7 @@ def _with_surface(h: Hypotheses, surface: Bool[np.ndarray, "G G G"]) -> Hypothes
     for shape in opacity:
         walls = np.pad(shape >= 255.0 * WALL_OPACITY, 1)
         near = np.zeros(len(at), bool)
-        for offset in np.ndindex(3, 3, 3):
+        for offset in np.argwhere(ndimage.generate_binary_structure(3, 1)):
             near |= walls[tuple((at + offset).T)]
         shape[tuple(at[~near].T)] = 255  # inside of a solid, too, where it is solid already
     return replace(h, opacity=opacity)
