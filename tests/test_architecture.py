@@ -104,7 +104,12 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "serial": ("calibration/turntable.py",),
     "depthai": ("perception/sources/oak.py",),
     # recorded logs; messages on the bus
-    "rosbags": ("perception/sources/log_messages.py", "perception/sources/recorder.py", "node/ros/messages.py"),
+    "rosbags": (
+        "perception/sources/log_messages.py",
+        "perception/sources/recorder.py",
+        "node/ros/bounded_reading.py",
+        "node/ros/messages.py",
+    ),
     "fsspec": ("foundation/store.py",),
     "pyarrow": ("node/commands/batch_table.py",),
     "dask": ("node/commands/batch_dask.py",),  # the extra `cluster`, imported when it is asked for

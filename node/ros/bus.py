@@ -155,7 +155,7 @@ class Bus:
         name, where, _ = self._entity("MS", name, kind, quality(depth, latched))
 
         def take(sample: Any, _: tuple[int, bytes]) -> None:
-            handler(decode(sample.payload.to_bytes(), kind))
+            handler(decode(sample.payload.to_bytes(), kind, self.config.max_parts))
 
         arrived = self._handle(name, depth, take)
         if latched:
@@ -190,8 +190,8 @@ class Bus:
             self.counts.add(name, "sent")
 
         def take(query: Any, tag: tuple[int, bytes]) -> None:
-            request = decode(query.payload.to_bytes() if query.payload is not None else b"", f"{kind}_Request")
-            answer(query, tag, handler(request))
+            data = query.payload.to_bytes() if query.payload is not None else b""
+            answer(query, tag, handler(decode(data, f"{kind}_Request", self.config.max_parts)))
 
         def refuse(query: Any, trouble: str) -> None:
             told = {name: value for name, value in (("success", False), ("message", trouble)) if name in own}
@@ -231,7 +231,7 @@ class Bus:
             )
             for reply in replies:
                 if reply.ok is not None:
-                    return decode(reply.ok.payload.to_bytes(), f"{kind}_Response")
+                    return decode(reply.ok.payload.to_bytes(), f"{kind}_Response", self.config.max_parts)
                 if (refusal := reply.err.payload.to_string()) != "Timeout":
                     raise OSError(f"{name} refused: {refusal}")
             time.sleep(min(0.05, max(0.0, left)))

@@ -30,14 +30,15 @@ class BusConfig:
     allowed: tuple[str, ...] = ()  # common names of admitted certificates; empty: all that TLS admits
     max_message_bytes: int = 64_000_000
     max_request_bytes: int = 4_000_000  # of a service's request
+    max_parts: int = 100_000  # of a message or request: the messages within it, such as detections and their boxes
     max_rate: float = 200.0  # messages per second of each topic, and of each sender on a topic or service
     use_sim_time: bool = False  # ages and diagnostics are by the time on /clock, of a simulation or a recording
 
     def __post_init__(self) -> None:
         if not 0 <= self.domain_id <= 232:
             raise ValueError(f"domain_id is {self.domain_id}; give 0 to 232")
-        if min(self.max_message_bytes, self.max_request_bytes) < 1 or not self.max_rate > 0:
-            raise ValueError("max_message_bytes, max_request_bytes and max_rate must be greater than 0")
+        if min(self.max_message_bytes, self.max_request_bytes, self.max_parts) < 1 or not self.max_rate > 0:
+            raise ValueError("max_message_bytes, max_request_bytes, max_parts and max_rate must be greater than 0")
         if not _NODE.fullmatch(self.name):
             raise ValueError(
                 f"name is {self.name!r}; use letters, digits and _ (its namespace is a setting of its own)"
