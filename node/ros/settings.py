@@ -72,8 +72,8 @@ class BusConfig:
             # No multicast scouting. Connected nodes announce the others (gossip), as ROS 2 nodes do.
             "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True}},
             "timestamping": {"enabled": True},  # which late joiners need
-            # A sender above the limit is received and counted; far above it, its connection ends.
-            "transport": {"link": {"rx": {"max_message_size": 2 * self.max_message_bytes + (1 << 20)}}},
+            # What is above the limit is received and counted, up to 4 times it; above that nothing can be said of it.
+            "transport": {"link": {"rx": {"max_message_size": 4 * self.max_message_bytes + (1 << 20)}}},
         }
         if self.tls_key is not None:
             certificate, own_key = str(self.tls_certificate), str(self.tls_key)

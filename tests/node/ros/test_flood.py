@@ -91,7 +91,8 @@ def test_one_client_floods_and_another_is_answered() -> None:
     assert any("/set: requests of one client come faster than they are answered" in line for line in said)
 
 
-def test_a_large_image_passes_and_one_beyond_the_limit_is_refused_unread() -> None:
+@pytest.mark.parametrize("size", [64_000_001, 200_000_000])
+def test_a_large_image_passes_and_one_beyond_the_limit_is_refused_unread(size: int) -> None:
     """Colour of 3840 x 2160 pixels has 25 MB; the limit is 64 MB. The line names the topic, the size and the limit."""
     port, said, came = free_port(), list[str](), list[Any]()
     pixels = np.zeros((2160, 3840, 3), np.uint8)
@@ -101,7 +102,7 @@ def test_a_large_image_passes_and_one_beyond_the_limit_is_refused_unread() -> No
         Bus(BusConfig(name="camera", connect=(f"tcp/127.0.0.1:{port}",))) as camera,
     ):
         bus.subscribe("/image", IMAGE, came.append)
-        where, size = key(0, "/image", IMAGE, type_hash(IMAGE)), 64_000_001
+        where = key(0, "/image", IMAGE, type_hash(IMAGE))
         block, deadline = zenoh.CongestionControl.BLOCK, time.monotonic() + WAIT_S
 
         def send(data: bytes) -> None:
