@@ -1,4 +1,4 @@
-"""OMPL plans past an object of which the camera sees one side, by three rules about what nobody saw.
+"""OMPL plans past an object of which the camera sees one side, against each thing that Farside gives to planners.
 
     pip install ompl
     python examples/05_ompl_planner.py --start 0.0 -0.3 0.0 --goal -0.07 0.07 0.0 --file out/one_frame/object_1.npz
@@ -7,12 +7,16 @@ or of a node that runs (farside live SOURCE, with bus: {listen: [tcp/127.0.0.1:7
 
     python examples/05_ompl_planner.py --start 0.0 -0.3 0.0 --goal -0.07 0.07 0.0 --connect tcp/127.0.0.1:7447
 
-A ball is moved. OMPL keeps it clear of all voxels that a rule calls occupied. That is said of each voxel alone, so
-Farside is asked about the whole path then: how likely is all that the ball sweeps free, jointly over the hypotheses?
-Space outside the object's cube counts as free here, as in `04_reach_planner.py`.
+A ball is moved. OMPL keeps it clear of what is occupied: by two rules about what nobody saw, by Farside's voxels, and
+by the messages that a node gives, read back from their bytes: MoveIt's mesh, the octomap, nvblox's distances. All of
+them speak of each voxel alone, so Farside is asked about the whole path then: how likely is all that the ball sweeps
+free, jointly over the hypotheses? Space outside the object's cube counts as free here, as in `04_reach_planner.py`; of a
+way that lies there as a whole nobody knows (nan).
 """
 
+import struct
 import threading
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,42 +27,124 @@ from jaxtyping import Bool, Float
 
 import farside
 from node.ros.bus import Bus
-from node.ros.messages import HYPOTHESES, hypotheses_from
-from node.ros.settings import BusConfig
+from node.ros.messages import HYPOTHESES, decode, encode, hypotheses_from, make
+from node.ros.octree import LEVELS
+from node.ros.planner_messages import ESDF, collision_object, octomap_message
+from node.ros.services import Answers
+from node.ros.settings import BusConfig, PlannerConfig
 from probnerf.types import BASE_Z
 
 AROUND = 0.4  # m; the ball stays so near to the object's middle
+EDGE = 0.004  # m; between the points of a mesh to which distances are taken
+
+Clear = Callable[[Float[np.ndarray, "3"]], bool]  # whether the ball may be there (m, object frame)
 
 
-def occupied(h: farside.Hypotheses, risk: float) -> dict[str, Bool[np.ndarray, "V"]]:
-    """Which voxels each rule keeps clear of."""
+def rules(h: farside.Hypotheses, risk: float, radius: float) -> dict[str, Clear]:
+    """When the ball is clear, by each rule and message."""
     risky, seen, unseen = h.p_occupied.ravel() > risk, h.seen.ravel(), h.unseen.ravel()
-    return {"unknown is free": risky & seen, "unknown is occupied": risky | unseen, "Farside": risky}
+    of_seen, planner = in_voxels(h, risky & seen, radius), PlannerConfig(risk=risk)
+    answers = Answers(planner=planner)
+    answers.update([h])
+    solid = read_back(collision_object(h, answers.node, planner))
+    octomap = in_octomap(read_back(octomap_message([h], answers.node, planner.octomap_m)), radius)
+    field = read_back(answers.distances(make(f"{ESDF}_Request", frame_id="object")))
+    return {
+        "unknown is free": of_seen,
+        "unknown is occupied": in_voxels(h, risky | unseen, radius),
+        "Farside": in_voxels(h, risky, radius),
+        "MoveIt's mesh": in_mesh(solid, radius),
+        "octomap": lambda place: of_seen(place) and octomap(place),  # which is of unseen space alone
+        "nvblox's distances": in_distances(field, planner.unknown_m, radius),
+    }
+
+
+def read_back(message: Any) -> Any:
+    """What a planner has of it."""
+    return decode(bytes(encode(message)), message.__msgtype__)
+
+
+def in_voxels(h: farside.Hypotheses, blocked: Bool[np.ndarray, "V"], radius: float) -> Clear:
+    steps = np.arange(-radius, radius + h.voxel_m, h.voxel_m)
+    ball = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    ball = ball[np.linalg.norm(ball, axis=1) <= radius]
+
+    def clear(place: Float[np.ndarray, "3"]) -> bool:
+        voxels = h.voxels("object", *(ball + place).T)
+        return not blocked[voxels[voxels >= 0]].any()
+
+    return clear
+
+
+def in_mesh(solid: Any, radius: float) -> Clear:
+    """By a moveit_msgs/CollisionObject, whose meshes lie in the object's frame: hollow surfaces, as to FCL."""
+    if not solid.meshes:
+        return lambda place: True
+    (mesh,) = solid.meshes
+    corners = np.array([(v.x, v.y, v.z) for v in mesh.vertices])
+    triangles = corners[[triangle.vertex_indices for triangle in mesh.triangles]]
+    parts = int(np.ceil(np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max() / EDGE))
+    share = np.array([(i, j, parts - i - j) for i in range(parts + 1) for j in range(parts + 1 - i)]) / parts
+    points = np.unique(np.round(share @ triangles, 5).reshape(-1, 3), axis=0)
+    return lambda place: bool((np.linalg.norm(points - place, axis=1) > radius + 0.5 * EDGE).all())
+
+
+def in_octomap(octomap: Any, radius: float) -> Clear:
+    """By the leaves whose P(occupied) is above a half: those that MoveIt takes for obstacles."""
+    data, low, edges = octomap.data.tobytes(), list[Any](), list[int]()
+
+    def read(at: int, corner: tuple[int, ...], edge: int) -> int:
+        """The node that begins at a byte, depth first; returns the byte behind it."""
+        log_odds, children = struct.unpack_from("<fB", data, at)
+        if not children and log_odds > 0:
+            low.append(corner)
+            edges.append(edge)
+        at += 5
+        for child in range(8):
+            if children >> child & 1:
+                at = read(at, tuple(c + (edge // 2) * (child >> axis & 1) for axis, c in enumerate(corner)), edge // 2)
+        return at
+
+    if data:
+        read(0, (-(1 << LEVELS - 1),) * 3, 1 << LEVELS)
+    first = np.reshape(low, (-1, 3)) * octomap.resolution
+    last = first + np.array(edges)[:, None] * octomap.resolution
+
+    def clear(place: Float[np.ndarray, "3"]) -> bool:
+        apart = np.maximum(0.0, np.maximum(first - place, place - last))
+        return not (np.linalg.norm(apart, axis=1) <= radius).any()
+
+    return clear
+
+
+def in_distances(field: Any, unknown: float, radius: float) -> Clear:
+    """By a response of nvblox_msgs/EsdfAndGradients in the object's frame."""
+    sizes = [dim.size for dim in field.esdf_and_gradients.layout.dim]
+    distance = np.reshape(field.esdf_and_gradients.data, sizes)
+    origin = np.array([field.origin_m.x, field.origin_m.y, field.origin_m.z])
+
+    def clear(place: Float[np.ndarray, "3"]) -> bool:
+        cell = np.floor((place - origin) / field.voxel_size_m).astype(int)
+        if (cell < 0).any() or (cell >= sizes).any():
+            return True
+        return bool(distance[tuple(cell)] == unknown or distance[tuple(cell)] > radius)
+
+    return clear
 
 
 def path(
     h: farside.Hypotheses,
-    blocked: Bool[np.ndarray, "V"],
+    clear: Clear,
     start: tuple[float, float, float],
     goal: tuple[float, float, float],
     radius: float,
     seconds: float,
 ) -> Float[np.ndarray, "n 3"] | None:
-    """Corners of a ball's way clear of the blocked voxels (m, object frame), or None. Raises SystemExit if OMPL is not
-    installed.
-    """
+    """Corners of a ball's way that is clear (m, object frame), or None. Raises SystemExit if OMPL is not installed."""
     try:
         from ompl import base, geometric, util
     except ImportError:
         raise SystemExit("OMPL is not installed; this example needs it: pip install ompl") from None
-    steps = np.arange(-radius, radius + h.voxel_m, h.voxel_m)
-    ball = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
-    ball = ball[np.linalg.norm(ball, axis=1) <= radius]
-
-    def clear(state: Any) -> bool:
-        voxels = h.voxels("object", *(ball + np.array([state[0], state[1], state[2]])).T)
-        return not blocked[voxels[voxels >= 0]].any()
-
     util.noOutputHandler()
     util.RNG.setSeed(1)
     space, bounds = base.RealVectorStateSpace(3), base.RealVectorBounds(3)
@@ -67,7 +153,7 @@ def path(
     bounds.setLow(2, BASE_Z * h.object_frame.half_extent + radius)  # above the table
     space.setBounds(bounds)
     setup = geometric.SimpleSetup(space)
-    setup.setStateValidityChecker(clear)
+    setup.setStateValidityChecker(lambda state: clear(np.array([state[0], state[1], state[2]])))
     setup.getSpaceInformation().setStateValidityCheckingResolution(0.5 * h.voxel_m / space.getMaximumExtent())
     ends = []
     for place in (start, goal):
@@ -126,7 +212,7 @@ def main(
     risk: float = 0.05,
     seconds: float = 5.0,
 ) -> dict[str, farside.QueryResult | None]:
-    """Plan by each rule, and say how likely the way is free.
+    """Plan by each rule and message, and say how likely the way is free.
 
     Args:
         start: metres, in the object's frame (x towards the camera, z up)
@@ -141,15 +227,16 @@ def main(
     """
     h = farside.load(file)[0] if file is not None else of_node(connect, node, object_id)
     answers: dict[str, farside.QueryResult | None] = {}
-    for rule, blocked in occupied(h, risk).items():
-        corners = path(h, blocked, start, goal, radius, seconds)
+    print(f"{'by':20}{'way, cm':>8}{'P(free)':>9}")
+    for rule, clear in rules(h, risk, radius).items():
+        corners = path(h, clear, start, goal, radius, seconds)
         answers[rule] = None
         if corners is None:
-            print(f"{rule}: no way found")
+            print(f"{rule:20}{'none':>8}")
             continue
         answers[rule] = answer = farside.query(h, swept(corners, radius), "object")
         length = np.linalg.norm(np.diff(corners, axis=0), axis=1).sum()
-        print(f"{rule}: {100 * length:.0f} cm, free with {answer.p_free:.2f}")
+        print(f"{rule:20}{100 * length:8.0f}{answer.p_free:9.2f}")
     return answers
 
 

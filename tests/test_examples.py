@@ -75,18 +75,29 @@ def test_reach_planner_takes_a_way_that_is_free_enough_and_no_doubtful_one(
 
 
 @pytest.mark.parametrize("source", ["file", "node"])
-def test_ompl_plans_where_shapes_are_known(example: Callable, tmp_path: Path, source: str) -> None:
-    """In unseen space: a goal clear of both handles that there may be, and one in the body, whose back nobody saw."""
+def test_ompl_plans_against_each_thing_that_planners_get(
+    example: Callable, tmp_path: Path, source: str, capsys: pytest.CaptureFixture
+) -> None:
+    """In unseen space: a goal clear of both handles that there may be, one in a handle with 0.3, one in the body."""
     pytest.importorskip("ompl")
     h, main, endpoint = body_with_handle(), example("05_ompl_planner"), f"tcp/127.0.0.1:{free_port()}"
+    careful = {"Farside", "MoveIt's mesh", "nvblox's distances"}
     with Bus(BusConfig(name="farside", listen=(endpoint,))) as bus:
         publisher = bus.publisher("~/hypotheses", HYPOTHESES, latched=True, depth=8)
         publisher.publish(hypotheses_message(h))
         where = {"file": farside.save(tmp_path, h)[0]} if source == "file" else {"connect": endpoint}
-        answers = main((0.0, -0.3, 0.0), (0.0, 0.1, 0.0), **where)
-        inside = main((0.0, 0.3, 0.0), (0.0, 0.025, 0.0), seconds=1.0, **where)
-    assert answers["Farside"].p_free == 1.0 and answers["unknown is occupied"] is None
-    assert inside["unknown is free"].p_free == 0.0 and inside["Farside"] is None
+        beside = main((0.0, -0.3, 0.0), (0.0, 0.1, 0.0), seconds=0.5, **where)
+        handle = main((0.0, 0.3, 0.0), (0.07, 0.03, 0.0), seconds=0.5, **where)
+        inside = main((0.0, 0.3, 0.0), (0.0, 0.025, 0.0), seconds=0.5, **where)
+    assert set(beside) == careful | {"unknown is free", "unknown is occupied", "octomap"}
+    found = [{rule: answer and answer.p_free for rule, answer in way.items()} for way in (beside, handle, inside)]
+    assert all(way["unknown is occupied"] is None for way in found)
+    assert all(found[0][rule] == 1.0 for rule in (*careful, "octomap"))
+    assert all(way[rule] is None for way in found[1:] for rule in careful)
+    assert found[1]["octomap"] == pytest.approx(0.7)  # MoveIt goes where P(occupied) is below a half
+    assert found[2]["octomap"] is None and found[2]["unknown is free"] == 0.0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 21 and lines[0].split() == ["by", "way,", "cm", "P(free)"]
 
 
 def test_ompl_planner_says_what_it_needs(example: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
