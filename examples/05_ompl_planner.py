@@ -10,8 +10,8 @@ or of a node that runs (farside live SOURCE, with bus: {listen: [tcp/127.0.0.1:7
 A ball is moved. OMPL keeps it clear of what is occupied: by two rules about what nobody saw, by Farside's voxels, and
 by the messages that a node gives, read back from their bytes: MoveIt's mesh, the octomap, nvblox's distances. All of
 them speak of each voxel alone, so Farside is asked about the whole path then: how likely is all that the ball sweeps
-free, jointly over the hypotheses? Space outside the object's cube counts as free here, as in `04_reach_planner.py`; of a
-way that lies there as a whole nobody knows (nan).
+free, jointly over the hypotheses? Space outside the object's cube counts as free here, as in `04_reach_planner.py`.
+Nobody knows of a way that lies there as a whole (nan).
 """
 
 import struct
