@@ -129,6 +129,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "embreex": ("perception/simulation/ray_caster.py",),  # the extra `meshes`, imported where it is needed
     "manifold3d": ("probnerf/objects/household_parts.py",),  # the same extra: exact booleans of solids
     "ompl": ("examples/05_ompl_planner.py",),  # the extra `planners`, imported where it is needed
+    "cyclonedds": ("examples/06_dds_relay.py",),  # the extra `dds`
     "rich": ("node/*", "benchmarks/*"),
     "PIL": ("node/figures/turning.py",),  # GIF
     "matplotlib": ("calibration/print_board.py", "node/figures/*", "benchmarks/*"),

@@ -39,7 +39,8 @@ def names(requirements: list[str]) -> set[str]:
 
 def test_every_imported_library_is_declared() -> None:
     """A package imports dependencies and those of the other extras; tests those of `dev`, too."""
-    runtime = names(project()["project"]["dependencies"] + extra("cluster") + extra("meshes") + extra("planners"))
+    others = [line for name in ("cluster", "dds", "meshes", "planners") for line in extra(name)]
+    runtime = names(project()["project"]["dependencies"] + others)
     developer = runtime | names(extra("dev"))
     distributions = packages_distributions()
     undeclared = []
@@ -57,6 +58,7 @@ def test_lock_has_an_exact_version_of_all_that_is_declared() -> None:
     lines = (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
     entries = [line for line in lines if line and not line.startswith((" ", "#"))]
     assert all(re.match(r"[\w.-]+==[\w.]+( ;.*)? \\$", entry) for entry in entries)  # and no option, no address
-    declared = project()["project"]["dependencies"] + extra("cluster") + extra("meshes") + extra("dev")
+    extras = [line for name in project()["project"]["optional-dependencies"] for line in extra(name)]
+    declared = project()["project"]["dependencies"] + extras
     missing = names(declared) - names(entries) - {"farside"}  # `farside[meshes]`: an extra that another one asks for
     assert not missing, f"requirements.lock lacks {', '.join(sorted(missing))}: run `make lock`"
