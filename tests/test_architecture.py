@@ -84,7 +84,7 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
         "benchmarks/household/flow.py",
         "benchmarks/rivals/*",
     ),
-    "safetensors": ("probnerf/prior/checkpoint.py", "benchmarks/rivals/model.py"),
+    "safetensors": ("probnerf/prior/checkpoint.py", "benchmarks/rivals/model.py", "benchmarks/rivals/inception.py"),
     "blackjax": (),  # an independent sampler to test against
     # pictures in a second, before matplotlib is imported; PNG files, resized
     "cv2": ("calibration/*", "perception/*", "node/*/segment*.py", "probnerf/*/srn*.py", "benchmarks/*/intrinsics.py"),

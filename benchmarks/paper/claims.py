@@ -19,7 +19,7 @@ from benchmarks.paper.annealing import by_chain
 from benchmarks.paper.conditioned import PLACES
 from benchmarks.paper.decoders import COST, DECODER
 from benchmarks.paper.methods import ENCODER, FIXED, HMC, HMC_DELTA, VI, VI_DELTA, Effort
-from benchmarks.paper.prior_samples import COUNTS, OTHERS, PAPER, SAMPLES, condition_of
+from benchmarks.paper.prior_samples import COUNTS, IN_INCEPTION, OTHERS, PAPER, condition_of, sampled
 from benchmarks.paper.renderers import by_step
 from benchmarks.paper.rival_answers import unhealthy
 from benchmarks.rivals.registry import RIVALS
@@ -113,7 +113,9 @@ def claims(lines: Sequence[Line]) -> list[Claim]:
 def _samples(lines: Sequence[Line]) -> list[Claim]:
     measured = {x["condition"] for x in lines}
     condition = next((c for n in sorted(COUNTS, reverse=True) if (c := condition_of("cars", n)) in measured), "")
-    value = {x["method"].removesuffix(SAMPLES): x["distance"] for x in lines if x["condition"] == condition}
+    own = [x for x in lines if x["condition"] == condition]
+    inception = any(x["method"].endswith(IN_INCEPTION) for x in own)
+    value = {sampled(x["method"]): x["distance"] for x in own if x["method"].endswith(IN_INCEPTION) == inception}
     floor = value.get(OTHERS, float("nan"))
     found = []
     pairs = (("ProbNeRF", FUNCTA), ("Functa, diffusion", "ProbNeRF"), ("pi-GAN", "ProbNeRF"), ("pi-GAN", FUNCTA))
@@ -124,7 +126,7 @@ def _samples(lines: Sequence[Line]) -> list[Claim]:
             continue
         a, b = value[better], value[worse]
         ours = f"{a:.2f}, {b:.2f} (true pictures: {floor:.2f})"
-        right = f"{CAVEAT}: other features, smaller models, no interval"
+        right = f"{CAVEAT}: {'' if inception else 'other features, '}smaller models, no interval"
         found.append(Claim(text, said, ours, right if a < b else NOT))
     return found
 

@@ -1,12 +1,14 @@
 """Prior samples: the Fréchet distance of each method's objects from true ones, at equal n.
 
 Each sample is seen once, by a random camera of the family. The same cameras see the true objects, and other true
-objects: their distance is what n alone makes. Features are those of `benchmarks.rivals.features`.
+objects: their distance is what n alone makes. Features are Inception's where the user gives its weights
+(`benchmarks.rivals.inception`), else those of `benchmarks.rivals.features`; each has rows and a table of its own.
 """
 
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -25,12 +27,14 @@ from benchmarks.paper.families import SPLITS, render
 from benchmarks.paper.judged import pictures
 from benchmarks.paper.methods import Effort, Question
 from benchmarks.paper.rival_answers import TrainedRival, shown_by
-from benchmarks.rivals.features import Features, features_of, load_features
+from benchmarks.rivals.features import features_of, load_features
+from benchmarks.rivals.inception import inception_features, load_inception
 from benchmarks.rivals.model import DiffusionGenerator, Generator
 from probnerf.inference import likelihood_settings
 
 COUNTS = (64, 256)  # pictures of each method
-SAMPLES = ": samples"  # after a method's name: of a name, the last settings alone count (`harness.results.newest`)
+# After a method's name, in each kind of features: of a name, the last settings alone count (`harness.results.newest`).
+SAMPLES, IN_INCEPTION = ": samples", ": samples, Inception"
 OTHERS = "true pictures of other cars"
 PAPER = {"ProbNeRF": 84.6, "Functa": 158.1, "Functa, diffusion": 80.3, "pi-GAN": 36.7}  # Inception FID, SRN Cars
 Pictures = Callable[[int, Float[np.ndarray, "n 4 4"]], Float[np.ndarray, "n s s 3"]]
@@ -38,18 +42,32 @@ Pictures = Callable[[int, Float[np.ndarray, "n 4 4"]], Float[np.ndarray, "n s s 
 
 @dataclass(frozen=True, eq=False)
 class FeatureFile:
-    """The network of features, and its name in tables."""
+    """A network of features, its name in tables, and what its rows' methods end with."""
 
-    model: Features
+    of: Callable[[Float[np.ndarray, "n s s 3"]], Float[np.ndarray, "n f"]]
     name: str
+    ending: str = SAMPLES
 
 
-def features_in(path: Path) -> FeatureFile | None:
-    """The network in this file; None where there is none. Raises ValueError for another file."""
+def features_in(path: Path, inception: Path | None = None) -> FeatureFile | None:
+    """Inception's features of these weights; without, the network in the file `path`; None where there is neither.
+
+    Raises ValueError for another file, and FileNotFoundError for weights that were asked for.
+    """
+    if inception is not None:
+        return FeatureFile(partial(inception_features, load_inception(inception)), _named(inception), IN_INCEPTION)
     if not path.is_file():
         return None
-    model, _ = load_features(path)
-    return FeatureFile(model, f"{path.stem} {hashlib.sha256(path.read_bytes()).hexdigest()[:8]}")
+    return FeatureFile(partial(features_of, load_features(path)[0]), _named(path))
+
+
+def _named(path: Path) -> str:
+    return f"{path.stem} {hashlib.sha256(path.read_bytes()).hexdigest()[:8]}"
+
+
+def sampled(method: str) -> str:
+    """The name of the method whose samples a row is of."""
+    return method.removesuffix(IN_INCEPTION).removesuffix(SAMPLES)
 
 
 def condition_of(family: str, n: int) -> str:
@@ -71,11 +89,11 @@ def measure(run: Run, rivals: Sequence[TrainedRival], features: FeatureFile, cou
         truth = None
         for name, (weights, made) in samplers.items():
             settings = {**weights, "features": features.name}
-            if (line := run.missing(f"{name}{SAMPLES}", settings, condition_of(run.family.name, n), 0)) is None:
+            if (line := run.missing(f"{name}{features.ending}", settings, condition_of(run.family.name, n), 0)) is None:
                 continue
             if truth is None:
-                truth = features_of(features.model, _true(run, 0)(n, T))
-            distance = frechet_distance(features_of(features.model, made(n, T)), truth)
+                truth = features.of(_true(run, 0)(n, T))
+            distance = frechet_distance(features.of(made(n, T)), truth)
             run.results.add({**line, "distance": round(distance, 4)})
             say(f"{line['condition']}, {name}: {distance:.3f}")
 
@@ -112,19 +130,20 @@ def _of(rival: TrainedRival, sample: Callable) -> Pictures:
 
 
 def tables(lines: Sequence[Line], rows: list[Row]) -> list[Table]:
-    """One of each family: distances by n, beside the paper's."""
+    """One of each family and kind of features: distances by n, beside the paper's."""
     found = []
-    own = [line for line in lines if ", prior samples, n " in line["condition"]]
-    for family in dict.fromkeys(line["condition"].split(",")[0] for line in own):
+    every = [line for line in lines if ", prior samples, n " in line["condition"]]
+    kinds = dict.fromkeys((line["condition"].split(",")[0], line["method"].endswith(IN_INCEPTION)) for line in every)
+    for family, inception in kinds:
         columns = [condition_of(family, n) for n in COUNTS]
-        value = {(x["method"].removesuffix(SAMPLES), x["condition"]): x["distance"] for x in own}
+        own = [x for x in every if x["condition"] in columns and x["method"].endswith(IN_INCEPTION) == inception]
+        value = {(sampled(x["method"]), x["condition"]): x["distance"] for x in own}
         names = dict.fromkeys(line["settings"]["features"] for line in own)
-        methods = list(dict.fromkeys(name for name, c in value if c in columns))
-        cells = []
-        for method in methods:
+        cells, metric = [], "fid" if inception else "frechet"
+        for method in dict.fromkeys(name for name, _ in value):
             for n, condition in zip(COUNTS, columns, strict=True):
                 if (method, condition) in value:
-                    rows.append(Row("paper", method, condition, "frechet", value[method, condition], "", n))
+                    rows.append(Row("paper", method, condition, metric, value[method, condition], "", n))
             shown = [f"{value[method, c]:.2f}" if (method, c) in value else "" for c in columns]
             cells.append([method, *shown, f"{PAPER[method]:g}" if method in PAPER else ""])
         title = f"{family}, prior samples: Fréchet distance in the features '{'; '.join(names)}'"

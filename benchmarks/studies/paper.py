@@ -24,7 +24,10 @@ state: best, 4th, worst. `spread` is best less worst.
 
 prior samples (the paper's table of FIDs): the Fréchet distance of each method's objects from true ones, each seen once,
 in features of a network that was trained apart from all methods (`benchmarks.rivals.features`), at equal n. It falls
-with n: only columns can be compared, beside the distance of two sets of true pictures.
+with n: only columns can be compared, beside the distance of two sets of true pictures. With `--inception FILE`, the
+weights of InceptionV3 that FIDs are of (`benchmarks/rivals/inception.py` says how to write them), it is made in those
+features instead, with rows and a table of its own. The weights are not part of this project: of that network structure
+and arithmetic were tested, on random weights, and no FID was measured.
 
 delta: HMC on informative views with other scales sqrt(alpha); and other people's cars, which the prior does not know
 (`--meshes`: a folder of Gazebo's models, which is not part of this repository).
@@ -86,6 +89,8 @@ class Options(ResumedOptions):
     """Folder of the rivals' weights."""
     features: Annotated[Path, tyro.conf.arg(metavar="FILE")] = FEATURES
     """Weights of the network of features."""
+    inception: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
+    """Weights of InceptionV3 (`benchmarks/rivals/inception.py`): prior samples are compared in its features instead."""
     meshes: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: none)")] = None
     """Folder of Gazebo's models: other people's cars."""
     seed: int = 0
@@ -139,6 +144,7 @@ def main(options: Options) -> Summary:
         )
     priors = {family.name: prior_of(family) for family in families}
     rivals = {family.name: trained_rivals(options.rivals, family) for family in families if family.name == "cars"}
+    features = prior_samples.features_in(options.features, options.inception)
     anew = Results(options.out / "paper-small.jsonl") if options.small else results
 
     def measure() -> None:
@@ -152,7 +158,7 @@ def main(options: Options) -> Summary:
             if "posteriors" in wanted:
                 posteriors.measure(run, [m for m in METHODS if m.name in asked], own)
             if family.name == "cars":
-                _of_cars(options, run, wanted, own)
+                _of_cars(options, run, wanted, own, features)
 
     def summed() -> Summary | None:
         found = summary(results.lines, replace(options, small=False))
@@ -163,12 +169,18 @@ def main(options: Options) -> Summary:
     return resumed(anew, options, measure, summed)
 
 
-def _of_cars(options: Options, run: Run, wanted: Sequence[str], rivals: Sequence[TrainedRival]) -> None:
+def _of_cars(
+    options: Options,
+    run: Run,
+    wanted: Sequence[str],
+    rivals: Sequence[TrainedRival],
+    features: prior_samples.FeatureFile | None,
+) -> None:
     """The experiments that the paper made on cars alone, each on some of the objects."""
     part = replace(run, count=max(1, run.count if options.small else run.count // 3))
     if "annealing" in wanted:
         annealing.measure(part)
-    if "samples" in wanted and (features := prior_samples.features_in(options.features)) is not None:
+    if "samples" in wanted and features is not None:
         counts = prior_samples.COUNTS[:1] if options.quick or options.small else prior_samples.COUNTS
         prior_samples.measure(run, rivals, features, counts)
     if "renderers" in wanted:

@@ -9,7 +9,7 @@ from benchmarks.paper.annealing import ANNEALING
 from benchmarks.paper.claims import BACK, CAVEAT, FUNCTA, NOT, REPRODUCED, UNMEASURED, claims, paired, tables, verdict
 from benchmarks.paper.decoders import COST, DECODER
 from benchmarks.paper.methods import FIXED, HMC, HMC_DELTA, SHORT, VI
-from benchmarks.paper.prior_samples import COUNTS, condition_of
+from benchmarks.paper.prior_samples import COUNTS, IN_INCEPTION, condition_of
 from benchmarks.paper.renderers import RENDERERS
 from benchmarks.paper.rival_answers import TRAINING
 
@@ -81,6 +81,10 @@ def test_each_claim_follows_its_rows() -> None:
     assert of(lines, "prior samples of ProbNeRF are nearer than Functa's").startswith(CAVEAT)
     lines = answers("ProbNeRF", "distance", [6.0], condition) + answers(FUNCTA, "distance", [5.0], condition)
     assert of(lines, "prior samples of ProbNeRF are nearer than Functa's") == NOT
+
+    lines += answers(f"ProbNeRF{IN_INCEPTION}", "distance", [80.0], condition)
+    lines += answers(f"{FUNCTA}{IN_INCEPTION}", "distance", [150.0], condition)
+    assert "other features" not in of(lines, "prior samples of ProbNeRF are nearer than Functa's")
 
     lines = answers(f"NeRF-VAE, own sizes{DECODER}", "ratio", [9.0, 9.1], f"cars, {COST}")
     assert of(lines, "hypernetwork's field").startswith(CAVEAT)

@@ -1,5 +1,6 @@
 """The paper's other experiments, on a tiny model: rows once, and tables of what they say."""
 
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.harness.results import Results, newest
+from benchmarks.harness.rows import Row
 from benchmarks.measures.frechet import frechet_distance
 from benchmarks.paper import decoders, deltas, prior_samples, renderers
 from benchmarks.paper.conditioned import PLACES
@@ -30,7 +32,7 @@ def run(tmp_path: Path) -> Run:
 def test_prior_samples_have_a_distance_in_named_features(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(prior_samples, "COUNTS", (3, 4))
     model = Features(FeatureSizes((4, 4), 4), jax.random.key(0))
-    features = prior_samples.FeatureFile(model, "mine 1234")
+    features = prior_samples.FeatureFile(partial(features_of, model), "mine 1234")
     for _ in range(2):  # the second time nothing is made
         prior_samples.measure(run, [], features, (3,))
     names = ["ProbNeRF", prior_samples.OTHERS]
@@ -43,6 +45,28 @@ def test_prior_samples_have_a_distance_in_named_features(run: Run, monkeypatch: 
     other = prior_samples._true(run, 4)(3, T)
     expected = frechet_distance(features_of(model, other), features_of(model, truth))
     assert run.results.lines[1]["distance"] == pytest.approx(expected, abs=1e-3)
+
+
+def test_inception_s_rows_hide_no_others_and_have_a_table_of_their_own(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(prior_samples, "COUNTS", (3, 4))
+    monkeypatch.setattr(prior_samples, "load_inception", lambda path: {})
+    monkeypatch.setattr(
+        prior_samples, "inception_features", lambda weights, rgb: rgb[:, ::32, ::32].reshape(len(rgb), -1)
+    )
+    (tmp_path / "inception.npz").write_bytes(b"weights")
+    own = prior_samples.FeatureFile(lambda rgb: rgb.mean(axis=(1, 2)), "mine 1234")
+    inception = prior_samples.features_in(tmp_path / "none", tmp_path / "inception.npz")
+    assert inception is not None and inception.name.startswith("inception ")
+    for features in (own, inception):
+        prior_samples.measure(run, [], features, (3,))
+    assert newest(run.results.lines, run.prior.identity) == run.results.lines
+    rows: list[Row] = []
+    first, second = prior_samples.tables(run.results.lines, rows)
+    assert "mine 1234" in first.title and inception.name in second.title and "mine" not in second.title
+    assert [line[0] for line in first.lines] == [line[0] for line in second.lines] == ["ProbNeRF", prior_samples.OTHERS]
+    assert [row.metric for row in rows] == ["frechet"] * 2 + ["fid"] * 2
 
 
 def test_features_that_are_not_there_are_none(tmp_path: Path) -> None:
