@@ -2,8 +2,10 @@
 
 The paper gives numbers for prior samples alone; its other claims are curves and bars, so that their numbers here are
 words. A claim is *reproduced* where the 95% interval of its paired difference lies on the claim's side, *not
-reproduced* where it lies on the other side, and comes *with a caveat* where it holds both, or where one object, a
-ratio without an interval, or smaller models say it. Beside a rival that is not healthy alone nothing is claimed.
+reproduced here* where it lies on the other side, and comes *with a caveat* where it holds both, or where one object, a
+ratio without an interval, or an experiment that is not the paper's says it. Beside a rival that is not healthy alone
+nothing is claimed. All verdicts are of this project's prior, cars and schedule, which are smaller than the paper's:
+what fails here does not refute the paper.
 """
 
 from collections.abc import Sequence
@@ -15,20 +17,28 @@ from benchmarks.harness.intervals import PairedInterval, paired_interval
 from benchmarks.harness.results import Line
 from benchmarks.harness.tables import Table, ranged
 from benchmarks.measures.renderer_acceptance import FOAM, QUADRATURE
-from benchmarks.paper.annealing import by_chain
+from benchmarks.paper.annealing import accepted, by_chain
 from benchmarks.paper.conditioned import PLACES
-from benchmarks.paper.decoders import COST, DECODER
-from benchmarks.paper.methods import ENCODER, FIXED, HMC, HMC_DELTA, VI, VI_DELTA, Effort
+from benchmarks.paper.decoders import COST, DECODER, FUNCTA_PUBLISHED
+from benchmarks.paper.methods import ENCODER, FIXED, FIXED_TUNED, HMC, HMC_DELTA, VI, VI_DELTA, Effort
 from benchmarks.paper.prior_samples import COUNTS, IN_INCEPTION, OTHERS, PAPER, condition_of, sampled
-from benchmarks.paper.renderers import by_step
+from benchmarks.paper.renderers import RAYS, by_step
 from benchmarks.paper.rival_answers import unhealthy
 from benchmarks.rivals.registry import RIVALS
 
-REPRODUCED, NOT, CAVEAT, UNMEASURED = "reproduced", "not reproduced", "with a caveat", "not measured"
+REPRODUCED, NOT, CAVEAT, UNMEASURED = "reproduced", "not reproduced here", "with a caveat", "not measured"
 BACK, TELLING = (f"cars, {place.name}" for place in PLACES["cars"])
 FUNCTA = RIVALS["functa"].label
 NO_WORSE = -0.5  # dB that count as no negative effect
 HIGH, LOW = 0.65, 0.3  # acceptance that is high, and that is low
+SAME = 0.1  # difference of two acceptances that count as equal
+UNASKED = (  # claims of the paper that no experiment of these asks, and why
+    ("hmc's and vi's pictures are more realistic than Functa's: FID", "lower", "no Inception features of answers"),
+    ("delta makes pictures of the given view more realistic: FID", "lower", "no Inception features of answers"),
+    ("delta does no harm to samples of the prior", "no harm", "samples are drawn without it"),
+    ("hmc is more diverse than vi on people, from the left half of a picture", "higher", "no prior of people is kept"),
+    ("delta raises the given view's quality less on people than on cars", "less", "no prior of people is kept"),
+)
 PUBLISHED = (  # psnr of one view of SRN Cars, dB, from the papers themselves
     ("pixelNeRF", "23.2"), ("CodeNeRF", "22.7 to 23.8"), ("VisionNeRF", "22.9"), ("SSDNeRF", "23.5"),
     ("Splatter Image", "24.0"),
@@ -87,8 +97,8 @@ def claims(lines: Sequence[Line]) -> list[Claim]:
             found.append(_difference(text, "higher", i, "", 3, also=also))
     for condition in (BACK, TELLING):
         for metric, words in (("psnr_given", "the given view"), ("psnr_heldout", "held-out views")):
-            i = paired(lines, condition, metric, HMC.name, FUNCTA)
-            text = f"hmc is more accurate than Functa's MAP on {words} ({condition})"
+            i = paired(lines, condition, metric, HMC_DELTA.name, FUNCTA)  # the paper's whole model
+            text = f"{HMC_DELTA.name} is more accurate than Functa's MAP on {words} ({condition})"
             found.append(_difference(text, "higher", i, " dB", 1, also=smaller))
     found += _samples(lines)
     if FUNCTA in (ill := unhealthy(lines)):  # it would be a straw man
@@ -99,15 +109,33 @@ def claims(lines: Sequence[Line]) -> list[Claim]:
     for condition in (BACK, TELLING):
         i = paired(lines, condition, "psnr_given", HMC_DELTA.name, HMC.name)
         found.append(_difference(f"delta raises the given view's quality ({condition})", "higher", i, " dB", 1))
-    i = paired(lines, BACK, "psnr_heldout", HMC_DELTA.name, HMC.name)
-    found.append(_difference("delta does no harm to held-out views (uninformative)", "no worse", i, " dB", 1, NO_WORSE))
-    i = paired(lines, TELLING, "psnr_heldout", HMC_DELTA.name, HMC.name)
-    found.append(_difference("delta improves held-out views (informative)", "higher", i, " dB", 1))
+    found += _held_out(lines)
     for condition in (BACK, TELLING):
         i = paired(lines, condition, "psnr_given", HMC.name, ENCODER.name)
         text = f"the encoder alone fails to reconstruct new objects ({condition}): hmc above it"
         found.append(_difference(text, "poor", i, " dB", 1))
-    return [*found, *_cost(lines)]
+    found += _cost(lines)
+    return [*found, *(Claim(text, said, "", f"{UNMEASURED}: {why}") for text, said, why in UNASKED)]
+
+
+def _held_out(lines: Sequence[Line]) -> list[Claim]:
+    """Of delta. Draws that differ more have a lower psnr each, so that of their mean picture stands beside it."""
+    found = []
+    for condition, text, said, least in (
+        (BACK, f"delta does no harm to held-out views (uninformative): {-NO_WORSE:g} dB or less", "no worse", NO_WORSE),
+        (TELLING, "delta improves held-out views (informative)", "higher", 0.0),
+    ):
+        of_draws, of_mean = (
+            paired(lines, condition, metric, HMC_DELTA.name, HMC.name)
+            for metric in ("psnr_heldout", "psnr_heldout_of_mean")
+        )
+        claim = _difference(text, said, of_draws, " dB", 1, least)
+        if of_mean.n:
+            claim = replace(claim, ours=f"{claim.ours}; the mean picture's {ranged(of_mean, 1, '+')} dB")
+        if claim.verdict == NOT:
+            claim = replace(claim, verdict=f"{NOT}: its kept states are still tempered")
+        found.append(claim)
+    return found
 
 
 def _samples(lines: Sequence[Line]) -> list[Claim]:
@@ -127,11 +155,14 @@ def _samples(lines: Sequence[Line]) -> list[Claim]:
         a, b = value[better], value[worse]
         ours = f"{a:.2f}, {b:.2f} (true pictures: {floor:.2f})"
         right = f"{CAVEAT}: {'' if inception else 'other features, '}smaller models, no interval"
-        found.append(Claim(text, said, ours, right if a < b else NOT))
+        wrong = right.replace(CAVEAT, NOT)
+        found.append(Claim(text, said, ours, right if a < b else wrong))
     return found
 
 
 def _renderers(lines: Sequence[Line]) -> list[Claim]:
+    """The paper's experiment has a whole picture, and a prior that was trained with the renderer that is asked."""
+    other = f"{RAYS} pixels of a picture, one prior for both renderers"
     found = []
     for name, text, said in (
         (FOAM, "the foam's acceptance is high at small steps", "high"),
@@ -143,46 +174,54 @@ def _renderers(lines: Sequence[Line]) -> list[Claim]:
             continue
         step = min(steps)
         value, n = float(np.mean(steps[step])), len(steps[step])
-        right = value > HIGH if name == FOAM else value < LOW
-        if not right and LOW <= value <= HIGH:
+        if LOW <= value <= HIGH:
             words = f"{CAVEAT}: neither high nor low"
-        elif right and name == QUADRATURE:
-            words = f"{CAVEAT}: one prior for both renderers"
-        elif right:
-            words = REPRODUCED if n > 1 else f"{CAVEAT}: one draw of the prior"
+        elif (value > HIGH) == (name == FOAM):
+            words = f"{CAVEAT}: {other}"
         else:
-            words = NOT
+            words = f"{NOT}: {other}"
+        words += ", one draw of the prior" * (n == 1)
         found.append(Claim(text, said, f"{value:.2f} at a step of {step:g}, n {n}", words))
     return found
 
 
 def _annealing(lines: Sequence[Line]) -> list[Claim]:
-    annealed, fixed = by_chain(lines, HMC.name), by_chain(lines, FIXED.name)
-    both = [thing for thing in annealed if thing in fixed]
-    found = []
-    for name, text, sign in (
-        ("worst", "annealing is more faithful: the worst chain's picture", 1.0),
-        ("best", "annealing is more faithful: the best chain's picture", 1.0),
-        ("spread", "annealing is more consistent: fixed temperature's spread above it", -1.0),
+    """Beside one temperature with the paper's step, and with a step of the annealed chains' acceptance."""
+    annealed, found = by_chain(lines, HMC.name), []
+    for other, words, said in (
+        (FIXED, "one temperature", "better"),
+        (FIXED_TUNED, "one temperature with a tuned step", "not asked"),
     ):
-        pair = ([sign * x[thing][name] for thing in both] for x in (annealed, fixed))
-        found.append(_difference(text, "better", paired_interval(*pair), " dB", 1))
+        fixed = by_chain(lines, other.name)
+        both = [thing for thing in annealed if thing in fixed]
+        a, b = accepted(lines, HMC.name), accepted(lines, other.name)
+        also = f"its step is {'small' if b > a else 'large'}: acceptance {b:.2f}, annealed {a:.2f}"
+        for name, text, sign in (
+            ("worst", "more faithful than {}: the worst chain's picture", 1.0),
+            ("best", "more faithful than {}: the best chain's picture", 1.0),
+            ("spread", "more consistent than {}: its spread above annealing's", -1.0),
+        ):
+            i = paired_interval(*([sign * x[thing][name] for thing in both] for x in (annealed, fixed)))
+            text = f"annealing is {text.format(words)}"
+            found.append(_difference(text, said, i, " dB", 1, also=also if abs(a - b) > SAME else ""))
     return found
 
 
 def _cost(lines: Sequence[Line]) -> list[Claim]:
-    text = "the hypernetwork's field is cheaper than one that is told the latent at each point (NeRF-VAE, own sizes)"
-    said = "more than 100 times an evaluation, of Functa's 15 x 512"
-    ratios = [
-        x["ratio"] for x in lines if x["condition"].endswith(COST) and x["method"] == f"NeRF-VAE, own sizes{DECODER}"
-    ]
+    own = [x for x in lines if x["condition"].endswith(COST)]
+    text = "an evaluation of its field is cheaper than one of Functa's 15 x 512"
+    said, counted = "more than 100 times", [x["operations"] for x in own if x["method"] == f"ProbNeRF{DECODER}"]
+    ours = f"{FUNCTA_PUBLISHED / counted[0]:.0f} times the operations, counted" if counted else ""
+    words = f"{CAVEAT}: equal quality is not shown" if counted else UNMEASURED
+    found = [Claim(text, said, ours, words)]
+    text = "a picture is cheaper than of a field that is told the latent at each point (NeRF-VAE, own sizes)"
+    ratios = [x["ratio"] for x in own if x["method"] == f"NeRF-VAE, own sizes{DECODER}"]
     if not ratios:
-        return [Claim(text, said, "", UNMEASURED)]
+        return [*found, Claim(text, "large savings", "", UNMEASURED)]
     i = paired_interval(ratios, np.ones(len(ratios)))
-    ours = f"{1.0 + i.mean:.1f} times the pixels a second, n {i.n}"
-    found = verdict(i)
-    also = "both are small, and not of equal quality"
-    return [Claim(text, said, ours, f"{CAVEAT}: {also}" if found == REPRODUCED else found)]
+    ours, words = f"{1.0 + i.mean:.1f} times the pixels a second, n {i.n}", verdict(i)
+    also = f"{CAVEAT}: both are small, equal quality is not shown"
+    return [*found, Claim(text, "large savings", ours, also if words == REPRODUCED else words)]
 
 
 def tables(lines: Sequence[Line], effort: Effort) -> list[Table]:
@@ -193,22 +232,16 @@ def tables(lines: Sequence[Line], effort: Effort) -> list[Table]:
         f" VI of {effort.vi_steps} steps (1500) beside its own figures"
     )
     first = Table(title, ("claim", "the paper", "measured", "verdict"), cells)
-    pixel = RIVALS["pixel_nerf"].label
-    ours = {
-        name: [x["psnr_heldout"] for x in lines if x["condition"] == TELLING and x["method"] == name]
-        for name in (HMC.name, HMC_DELTA.name, pixel)
-    }
-    ill = unhealthy(lines)
-    shown = [
-        [
-            f"{name}, this project's cars, {TELLING.split(', ')[1]}{' (not healthy alone)' if name in ill else ''}",
-            f"{np.mean(v):.1f}",
-        ]
-        for name, v in ours.items()
-        if v
-    ]
+    pixel, ill = RIVALS["pixel_nerf"].label, unhealthy(lines)
+    shown = [[name, psnr, "", ""] for name, psnr in PUBLISHED]
+    for name in (HMC.name, HMC_DELTA.name, pixel):
+        own = [x for x in lines if x["condition"] == TELLING and x["method"] == name]
+        if own:
+            each = [f"{np.mean([x[m] for x in own]):.1f}" for m in ("psnr_heldout", "psnr_heldout_of_mean")]
+            words = f"{name}, this project's {TELLING}{' (not healthy alone)' * (name in ill)}"
+            shown.append([words, *each, str(len(own))])
     title = (
         "Published psnr of one view of SRN Cars, dB, from their papers. Other cars, 128 x 128 pixels and 250 views of"
-        " each: not comparable with this project's, which stand below"
+        " each: not comparable with this project's, which stand below, as a mean over draws and of the mean picture"
     )
-    return [first, Table(title, ("method", "psnr, dB"), [*map(list, PUBLISHED), *shown])]
+    return [first, Table(title, ("method", "psnr, dB", "of the mean picture", "n"), shown)]

@@ -97,14 +97,17 @@ class Method:
         return {**effort.settings, "delta": self.delta, **scale}
 
 
-def _hmc(delta: bool, fixed: float | None = None, delta_scale: float = DELTA_SCALE) -> Callable[[Question], Found]:
+def _hmc(
+    delta: bool, fixed: float | None = None, delta_scale: float = DELTA_SCALE, tuned: bool = False
+) -> Callable[[Question], Found]:
     def answer(q: Question) -> Found:
         keep = max(1, round(KEPT * q.effort.iterations / 100))
         hmc = AnnealedHMCConfig(
             chains=CHAINS, iterations=q.effort.iterations, leapfrog_steps=q.effort.leapfrog_steps, keep=keep
         )
         if fixed is not None:  # one temperature, the last; the step is proportional to s
-            hmc = replace(hmc, s_start=hmc.s_end, step_per_scale=fixed / hmc.s_end, tune_iterations=0)
+            hmc = replace(hmc, s_start=hmc.s_end, step_per_scale=fixed / hmc.s_end)
+            hmc = hmc if tuned else replace(hmc, tune_iterations=0)
         observation = q.view.observation(q.seed)
         likelihood = replace(likelihood_of(q.config(delta), observation, sample_pose=False), delta_scale=delta_scale)
         args = (q.model, likelihood, observation, faces_of_view(observation, likelihood))
@@ -166,6 +169,7 @@ def _own(q: Question) -> Found:
 HMC, VI = Method("hmc", _hmc(False)), Method("vi", _vi(False))
 HMC_DELTA, VI_DELTA = Method("hmc, delta", _hmc(True), delta=True), Method("vi, delta", _vi(True), delta=True)
 FIXED = Method("fixed temperature", _hmc(False, fixed=FIXED_STEP))
+FIXED_TUNED = Method("fixed temperature, tuned step", _hmc(False, fixed=FIXED_STEP, tuned=True))
 SWEEP = tuple(
     Method(f"hmc, delta x {scale:g}", _hmc(True, delta_scale=scale), delta=True, delta_scale=scale) for scale in SWEPT
 )

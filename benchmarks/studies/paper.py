@@ -1,14 +1,17 @@
 """The ProbNeRF paper's experiments on this project's own code, with the systems that it compares with, on cars.
 
 Objects of the test seeds of `benchmarks.paper.families`, of known pose, each from a telling and from an untelling place
-(`benchmarks.paper.conditioned`); one colour picture and no depth. The prior was trained by
-`python -m benchmarks.paper.train`. A family whose prior is not there (people) is left out.
+(`benchmarks.paper.conditioned`); one colour picture and no depth. Of its 64 x 64 pixels 256 are compared, each for four
+(the paper: all of 128 x 128). The prior was trained by `python -m benchmarks.paper.train`, for minutes and on pictures
+of 32 x 32. A family whose prior is not there (people) is left out. **These are the paper's experiments, not its
+sizes:** what fails here is not refuted, and n is small, as an answer takes minutes of a machine that does other work.
 
 posterior inference (the paper's figure of ablations): HMC as in the paper and mean-field VI, each with the weights'
-perturbation delta and without, beside this project's sampler, the encoder alone and the prior alone; and the rivals
-whose weights are in benchmarks/checkpoints/paper/rivals: Functa (MAP), NeRF-VAE (draws of its encoder's answer) and
-pixelNeRF. `python -m benchmarks.rivals.train` trains them; a table says which are there, how long they learnt, and
-whether each is healthy alone. A point estimate has no pixel_sd, and what hidden space a rival fills is not measured.
+perturbation delta (`hmc, delta` is the paper's whole model) and without (its ablation), beside this project's sampler,
+the encoder alone and the prior alone; and the rivals whose weights are in benchmarks/checkpoints/paper/rivals: Functa
+(MAP), NeRF-VAE (draws of its encoder's answer) and pixelNeRF. `python -m benchmarks.rivals.train` trains them; a table
+says which are there, how long they learnt, and whether each is healthy alone. A point estimate has no pixel_sd, and
+what hidden space a rival fills is not measured.
 
 - psnr_given, psnr_heldout: of an answer's pictures from the given place (of what was given) and from four others, dB, a
   mean over draws; psnr_heldout_of_mean: of the mean picture.
@@ -19,8 +22,9 @@ whether each is healthy alone. A point estimate has no pixel_sd, and what hidden
 the prior's gate: z~ is fitted to the solid of held-out objects (`benchmarks.measures.refitted`); iou of 64^3 voxels.
 
 annealing (the paper's figure of an ambulance's rear): vehicles from behind, 8 chains of HMC from the same starts, as
-the paper anneals it and at one temperature with its step of 0.0005. Chains are sorted by psnr_given of their last
-state: best, 4th, worst. `spread` is best less worst.
+the paper anneals it and at one temperature: with the paper's step of 0.0005, and with one that is tuned as the annealed
+chains' is. All take the same number of gradients, without delta. Chains are sorted by psnr_given of their last state:
+best, 4th, worst. `spread` is best less worst.
 
 prior samples (the paper's table of FIDs): the Fréchet distance of each method's objects from true ones, each seen once,
 in features of a network that was trained apart from all methods (`benchmarks.rivals.features`), at equal n. It falls
@@ -33,8 +37,12 @@ delta: HMC on informative views with other scales sqrt(alpha); and other people'
 (`--meshes`: a folder of Gazebo's models, which is not part of this repository).
 
 renderers (the paper's figure of acceptance): `farside bench acceptance` on cars, from a draw (z~, delta) of the prior.
+32 pixels of a picture are compared, and both renderers show one prior, which was trained through the foam; the paper
+trained a second one through quadrature, and compares all pixels. So this asks the same question of another posterior.
 
 decoders: pixels a second of this decoder, and of decoders that are told the latent at each point, in one run.
+
+pictures: `python -m benchmarks.paper.grids` draws uncurated samples and maps of pixel deviation, those below.
 
 The first table has the paper's claims with a verdict each, computed from these rows (`benchmarks.paper.claims`).
 
