@@ -114,8 +114,9 @@ def _section(name: str, transcription: dict[str, Any], drawn: Callable[[str, Sum
         ]
     else:
         return ""
-    shown = PAGE.parent / f"bench_{name}.png"
-    image = [f"![{what[0].splitlines()[0].rstrip('.')}]({shown.name})\n"] if shown.is_file() else []
+    shown = [PAGE.parent / f"bench_{name}.png", *sorted(PAGE.parent.glob(f"bench_{name}_grid_*.png"))]
+    words = what[0].splitlines()[0].rstrip(".")
+    image = [f"![{words}]({path.name})\n" for path in shown if path.is_file()]
     rest = [what[1] + "\n"] if len(what) > 1 else []
     return "\n".join([*head, *rest, *figures, *image])
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from benchmarks.harness.progress import say
 from benchmarks.harness.results import Line
@@ -31,6 +31,7 @@ from benchmarks.rivals.features import features_of, load_features
 from benchmarks.rivals.inception import inception_features, load_inception
 from benchmarks.rivals.model import DiffusionGenerator, Generator
 from probnerf.inference import likelihood_settings
+from probnerf.prior.networks import ProbNeRF
 
 COUNTS = (64, 256)  # pictures of each method
 # After a method's name, in each kind of features: of a name, the last settings alone count (`harness.results.newest`).
@@ -108,15 +109,18 @@ def _true(run: Run, first: int) -> Pictures:
 
 
 def _own(run: Run) -> Pictures:
-    def made(n: int, T: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n s s 3"]:
-        model = run.prior.model
-        z = jax.random.normal(jax.random.key(run.seed), (n, model.latent))
-        config = Question(None, model, Effort(), 0).config(delta=False)  # type: ignore[arg-type]
-        likelihood = likelihood_settings(config, sample_pose=False)
-        shown = [pictures(model, likelihood, z[i : i + 1], T[i : i + 1])[0, 0] for i in range(n)]
-        return np.stack(shown).astype(np.float32)
+    return lambda n, T: own_samples(run.prior.model, jax.random.key(run.seed), T)
 
-    return made
+
+def own_samples(
+    model: ProbNeRF, key: Array, T_object_camera: Float[np.ndarray, "n 4 4"]
+) -> Float[np.ndarray, "n s s 3"]:
+    """Pictures of n draws of the prior, each from its camera."""
+    z = jax.random.normal(key, (len(T_object_camera), model.latent))
+    config = Question(None, model, Effort(), 0).config(delta=False)  # type: ignore[arg-type]
+    likelihood = likelihood_settings(config, sample_pose=False)
+    each = ((z[i : i + 1], T_object_camera[i : i + 1]) for i in range(len(z)))
+    return np.stack([pictures(model, likelihood, *one)[0, 0] for one in each]).astype(np.float32)
 
 
 def _of(rival: TrainedRival, sample: Callable) -> Pictures:
