@@ -17,7 +17,7 @@ from benchmarks.paper.families import Subject
 from benchmarks.paper.methods import DELTA_SCALE, HMC, HMC_DELTA, OWN, SWEEP
 from benchmarks.paper.posteriors import Rated, keep_answer, keep_rival
 from benchmarks.paper.rival_answers import TrainedRival
-from benchmarks.scenes.road_meshes import MODELS, read_road_mesh
+from benchmarks.scenes.road_meshes import MODELS, read_road_mesh, road_mesh_file
 
 TELLING = PLACES["cars"][1]
 INFORMATIVE = f"cars, {TELLING.name}"
@@ -33,6 +33,12 @@ def measure_sweep(run: Run) -> None:
         view = Conditioned(run.family, seed, TELLING, run.prior.model.preset.image_size)
         for method in (HMC, HMC_DELTA, *SWEEP):
             keep_answer(run, method, view, INFORMATIVE, seed, rate)
+
+
+def check_others(folder: Path) -> None:
+    """Raises FileNotFoundError if the folder lacks one of the others' cars."""
+    for name in MODELS:
+        road_mesh_file(folder, name)
 
 
 def measure_others(run: Run, folder: Path, rivals: Sequence[TrainedRival]) -> None:

@@ -10,7 +10,7 @@ from benchmarks.harness.rows import Row
 from benchmarks.harness.tables import Table, ranged
 from benchmarks.paper.families import SPLITS, Family
 from benchmarks.paper.methods import HMC, Effort
-from probnerf.prior.checkpoint import Prior
+from probnerf.prior.checkpoint import Prior, load_prior
 
 UNITS = {
     "psnr_given": "dB", "psnr_heldout": "dB", "psnr_heldout_of_mean": "dB", "pixel_sd": "", "hidden_nll": "nats",
@@ -44,6 +44,17 @@ class Run:
             "object": thing, "seed": self.seed,
         }  # fmt: skip
         return None if line in self.results else line
+
+
+def prior_of(family: Family, path: Path) -> Prior:
+    """The family's prior. Raises ValueError where it learnt another family, and as `load_prior` does."""
+    prior = load_prior(path)
+    if (learnt := prior.metadata.get("family", "another family")) != family.name:
+        raise ValueError(
+            f"{path} was trained on '{learnt}', not on '{family.name}'; train one with"
+            f" `python -m benchmarks.paper.train --family {family.name}`"
+        )
+    return prior
 
 
 def answer_table(condition: str, lines: Sequence[Line], rows: list[Row], order: Sequence[str]) -> Table:

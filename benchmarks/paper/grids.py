@@ -26,11 +26,11 @@ from benchmarks.harness.progress import say
 from benchmarks.harness.study import selected
 from benchmarks.paper.annealing import BACK, COMPARED, rear_seeds
 from benchmarks.paper.conditioned import SIZE, Conditioned
+from benchmarks.paper.experiment import prior_of
 from benchmarks.paper.families import FAMILIES, SPLITS, Family, render
 from benchmarks.paper.judged import DRAWS, pictures
 from benchmarks.paper.methods import CHAINS, HMC, HMC_DELTA, SHORT, VI, VI_DELTA, Effort, Found, Method, Question
 from benchmarks.paper.prior_samples import own_samples
-from probnerf.prior.checkpoint import load_prior
 from probnerf.prior.networks import ProbNeRF
 from probnerf.sampling.populations import thin
 
@@ -60,9 +60,10 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Draw the sheets. Raises ValueError for an unknown one, and as `load_prior` does."""
+    """Draw the sheets. Raises ValueError for an unknown one, and as `prior_of` does."""
     asked = selected(options.sheets, SHEETS, "sheet")
-    model, family = load_prior(options.prior).model, FAMILIES["cars"]
+    family = FAMILIES["cars"]
+    model = prior_of(family, options.prior).model
     effort = Effort() if options.full else SHORT
     if "samples" in asked:
         save(options.out, "samples", sample_rows(model, family))

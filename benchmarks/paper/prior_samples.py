@@ -50,15 +50,17 @@ class FeatureFile:
     ending: str = SAMPLES
 
 
-def features_in(path: Path, inception: Path | None = None) -> FeatureFile | None:
-    """Inception's features of these weights; without, the network in the file `path`; None where there is neither.
+def features_in(path: Path, inception: Path | None = None) -> FeatureFile:
+    """Inception's features of these weights; without, those of the network in the file `path`.
 
-    Raises ValueError for another file, and FileNotFoundError for weights that were asked for.
+    Raises FileNotFoundError or ValueError in one line.
     """
     if inception is not None:
         return FeatureFile(partial(inception_features, load_inception(inception)), _named(inception), IN_INCEPTION)
     if not path.is_file():
-        return None
+        raise FileNotFoundError(
+            f"{path}: no such network of features; train one with `python -m benchmarks.rivals.features`"
+        )
     return FeatureFile(partial(features_of, load_features(path)[0]), _named(path))
 
 

@@ -61,8 +61,13 @@ class TrainedRival:
 def trained_rivals(folder: Path, family: Family) -> list[TrainedRival]:
     """Those of the registry whose weights are in the folder, in its order.
 
-    Raises ValueError for a file that is no rival, is another rival's, or learnt another family.
+    Raises FileNotFoundError if there is no folder, and ValueError for a file that is no rival, is another rival's, or
+    learnt another family.
     """
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"{folder}: no such folder of rivals; train some with `python -m benchmarks.rivals.train`"
+        )
     found = []
     for name in RIVALS:
         path = folder / f"{name}.safetensors"

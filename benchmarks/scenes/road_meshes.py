@@ -78,15 +78,21 @@ class RoadMesh:
         return np.zeros(0, np.float32)
 
 
-def read_road_mesh(folder: Path, name: str) -> RoadMesh:
-    """The vehicle of this name. Raises FileNotFoundError or ValueError in one line."""
+def road_mesh_file(folder: Path, name: str) -> Path:
+    """The vehicle's file. Raises FileNotFoundError in one line."""
     found = sorted((folder / name / "meshes").glob("*.obj"))
     if not found:
         raise FileNotFoundError(f"{folder / name}/meshes holds no .obj; give a folder of Gazebo's models")
-    scene = trimesh.load_scene(BytesIO(found[0].read_bytes()), file_type="obj", resolver=_Textures(folder / name))
+    return found[0]
+
+
+def read_road_mesh(folder: Path, name: str) -> RoadMesh:
+    """The vehicle of this name. Raises FileNotFoundError or ValueError in one line."""
+    file = road_mesh_file(folder, name)
+    scene = trimesh.load_scene(BytesIO(file.read_bytes()), file_type="obj", resolver=_Textures(folder / name))
     parts = [part for part in scene.geometry.values() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not parts:
-        raise ValueError(f"{found[0]} holds no triangles")
+        raise ValueError(f"{file} holds no triangles")
     area = sum(part.area for part in parts)
     points, colours = [], []
     for part in parts:

@@ -65,15 +65,15 @@ from benchmarks.harness.rows import Row
 from benchmarks.harness.study import ResumedOptions, Summary, results_of, resumed, selected
 from benchmarks.harness.tables import Table
 from benchmarks.paper import annealing, claims, decoders, deltas, gate, posteriors, prior_samples, renderers
-from benchmarks.paper.experiment import UNITS, Run
+from benchmarks.paper.experiment import UNITS, Run, prior_of
 from benchmarks.paper.families import FAMILIES, SPLITS, Family
 from benchmarks.paper.methods import ENCODER, METHODS, PRIOR, SHORT, Effort
 from benchmarks.paper.rival_answers import TrainedRival, keep_training, trained_rivals, training_table
-from probnerf.prior.checkpoint import Prior, load_prior
 
 WEIGHTS = Path(__file__).resolve().parent.parent / "checkpoints" / "paper"
 RIVALS = WEIGHTS / "rivals"
 FEATURES = WEIGHTS / "features.safetensors"
+OTHER_UNITS = {"iou": "", "chains": "dB", "acceptance": "", "distance": "", "ratio": ""}  # of rows, beside `UNITS`
 SMALL = 4  # objects of an experiment that `--small` answers anew
 
 
@@ -129,30 +129,27 @@ def weights_of(family: Family) -> Path:
     return WEIGHTS / f"{family.name}.safetensors"
 
 
-def prior_of(family: Family) -> Prior:
-    """The family's prior. Raises ValueError where it learnt another family, and as `load_prior` does."""
-    path = weights_of(family)
-    prior = load_prior(path)
-    if (learnt := prior.metadata.get("family")) != family.name:
-        raise ValueError(
-            f"{path} was trained on '{learnt}', not on '{family.name}'; train one with"
-            f" `python -m benchmarks.paper.train --family {family.name}`"
-        )
-    return prior
-
-
 def main(options: Options) -> Summary:
-    """Measure what the file lacks, and sum up what it has."""
+    """Measure what the file lacks, and sum up what it has.
+
+    Raises ValueError or FileNotFoundError, before anything is measured, for what is not known or not there.
+    """
+    if options.n < 1:
+        raise ValueError(f"--n is {options.n}; give 1 object or more")
     asked = selected(options.methods, [m.name for m in METHODS], "method")
     wanted = selected(options.experiments, EXPERIMENTS, "experiment")
+    if options.meshes is not None and "others" in wanted:
+        deltas.check_others(options.meshes)
+    elif "others" in wanted and options.experiments:
+        raise ValueError("other people's cars are not part of this repository; give a folder of them with --meshes")
     results, families = results_of("paper", options), options.chosen
     if not families:
         raise ValueError(
             f"{WEIGHTS} holds no prior; train one with `python -m benchmarks.paper.train`, and copy it there"
         )
-    priors = {family.name: prior_of(family) for family in families}
+    priors = {family.name: prior_of(family, weights_of(family)) for family in families}
     rivals = {family.name: trained_rivals(options.rivals, family) for family in families if family.name == "cars"}
-    features = prior_samples.features_in(options.features, options.inception)
+    features = prior_samples.features_in(options.features, options.inception) if "samples" in wanted else None
     anew = Results(options.out / "paper-small.jsonl") if options.small else results
 
     def measure() -> None:
@@ -223,11 +220,11 @@ def summary(lines: list[Line], options: Options) -> Summary | None:
 
 
 def agreement(anew: Sequence[Line], kept: Sequence[Line]) -> Table:
-    """How far rows that were made anew are from the kept ones of the same identity."""
+    """How far rows that were made anew are from the kept ones of the same identity; of chains, the farthest."""
     before, cells = {key(line): line for line in kept}, []
-    for metric, unit in UNITS.items():
+    for metric, unit in {**UNITS, **OTHER_UNITS}.items():
         both = [(line, before[key(line)]) for line in anew if metric in line and key(line) in before]
-        differences = [abs(a[metric] - b[metric]) for a, b in both]
+        differences = [float(np.abs(np.subtract(a[metric], b[metric])).max()) for a, b in both]
         if differences:
             cells.append([metric, unit, str(len(both)), *(f"{f(differences):.4f}" for f in (np.median, np.max))])
     return Table("Made anew, beside the kept rows", ("", "unit", "answers", "median difference", "largest"), cells)

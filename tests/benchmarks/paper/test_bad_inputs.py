@@ -4,13 +4,14 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
 from benchmarks.harness.command import command
-from benchmarks.paper import families
+from benchmarks.paper import families, grids
 from benchmarks.paper.families import BODIES, CARS, write_srn
 from benchmarks.rivals import pictures, train
 from benchmarks.rivals.picture_set import PictureSet
@@ -98,3 +99,33 @@ def test_a_prior_of_another_family_is_refused(tmp_path: Path, monkeypatch: pytes
 def test_an_unknown_experiment_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"no experiment \['magic'\]; there are: gate; posteriors"):
         paper.main(paper.Options(tmp_path, experiments="magic"))
+
+
+def _asked(**options: Any) -> Callable[[Path], object]:
+    return lambda folder: paper.main(paper.Options(folder, results=folder / "rows.jsonl", **options))
+
+
+@pytest.mark.parametrize(
+    ("main", "message"),
+    [
+        (_asked(n=0), r"^--n is 0; give 1 object or more$"),
+        (_asked(rivals=Path("none")), r"^none: no such folder of rivals; train some with"),
+        (_asked(features=Path("none")), r"^none: no such network of features; train one with"),
+        (_asked(inception=Path("none")), r"^none: no such weights; "),
+        (_asked(meshes=Path("none")), r"^none/hatchback/meshes holds no \.obj; give a folder"),
+        (_asked(experiments="others"), r"not part of this repository; give a folder of them with --meshes$"),
+    ],
+)
+def test_what_is_not_there_is_refused_before_anything_is_measured(
+    main: Callable[[Path], object], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises((ValueError, FileNotFoundError), match=message) as error:
+        main(tmp_path)
+    assert "\n" not in str(error.value) and not list(tmp_path.iterdir())
+
+
+def test_grids_are_not_drawn_of_another_family(tmp_path: Path) -> None:
+    path = tmp_path / "prior.safetensors"
+    save_prior(path, ProbNeRF(PRESETS["tiny"], jax.random.key(0)), {})
+    with pytest.raises(ValueError, match=r"prior\.safetensors was trained on 'another family', not on 'cars'"):
+        grids.main(grids.Options(tmp_path, prior=path))

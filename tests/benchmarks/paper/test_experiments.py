@@ -69,8 +69,9 @@ def test_inception_s_rows_hide_no_others_and_have_a_table_of_their_own(
     assert [row.metric for row in rows] == ["frechet"] * 2 + ["fid"] * 2
 
 
-def test_features_that_are_not_there_are_none(tmp_path: Path) -> None:
-    assert prior_samples.features_in(tmp_path / "none.safetensors") is None
+def test_features_that_are_not_there_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"none\.safetensors: no such network of features; train one with"):
+        prior_samples.features_in(tmp_path / "none.safetensors")
     (tmp_path / "bad.safetensors").write_bytes(b"no")
     with pytest.raises(ValueError, match=r"bad.safetensors is not a readable"):
         prior_samples.features_in(tmp_path / "bad.safetensors")
