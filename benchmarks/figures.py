@@ -116,7 +116,8 @@ def _section(name: str, transcription: dict[str, Any], drawn: Callable[[str, Sum
         return ""
     shown = [PAGE.parent / f"bench_{name}.png", *sorted(PAGE.parent.glob(f"bench_{name}_grid_*.png"))]
     words = what[0].splitlines()[0].rstrip(".")
-    image = [f"![{words}]({path.name})\n" for path in shown if path.is_file()]
+    names = [words, *(path.stem.split("_grid_")[1].capitalize() for path in shown[1:])]
+    image = [f"![{text}]({path.name})\n" for text, path in zip(names, shown, strict=True) if path.is_file()]
     rest = [what[1] + "\n"] if len(what) > 1 else []
     return "\n".join([*head, *rest, *figures, *image])
 

@@ -1,5 +1,9 @@
 """The paper's experiments: what a picture shows and hides, that answers are judged by it, and rows made only once."""
 
+import os
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.harness.machine import ROOT
+from benchmarks.harness.results import Line, read_lines
 from benchmarks.paper import annealing, gate, posteriors
 from benchmarks.paper.annealing import ANNEALING, rear_seeds
 from benchmarks.paper.conditioned import HELD_OUT, OBJECT_RAYS, PLACES, SIZE, Conditioned, base_rate, rays_of
@@ -162,3 +168,32 @@ def test_rows_are_kept_and_summed_up(tmp_path: Path, model: ProbNeRF, monkeypatc
     monkeypatch.setattr(paper, "weights_of", lambda _: tmp_path / "none")
     with pytest.raises(ValueError, match="train one with"):
         main(Options(tmp_path))
+
+
+@pytest.mark.slow
+def test_a_killed_run_goes_on_and_has_the_same_rows(tmp_path: Path) -> None:
+    """`--small`, killed when it has fitted one object of three, and begun again; beside a run that nothing ended."""
+
+    def begun(name: str) -> subprocess.Popen:
+        asked = ["--small", "--n", "3", "--experiments", "gate", "--out", str(tmp_path / name)]
+        command = [sys.executable, "-m", "farside", "bench", "paper", *asked]
+        path, none = {**os.environ, "PYTHONPATH": str(ROOT)}, subprocess.DEVNULL
+        return subprocess.Popen(command, cwd=ROOT, env=path, stdout=none, stderr=none)
+
+    def rows(name: str) -> list[Line]:
+        lines = read_lines(tmp_path / name / "paper-small.jsonl")
+        return [{k: v for k, v in line.items() if k not in ("machine", "revision")} for line in lines]
+
+    def fitted(name: str) -> int:
+        return sum("iou" in line for line in rows(name))
+
+    with begun("killed") as killed:
+        while fitted("killed") < 1:
+            assert killed.poll() is None
+            time.sleep(0.02)
+        killed.kill()
+    assert fitted("killed") < 3
+    for name in ("killed", "whole"):
+        with begun(name) as run:
+            assert run.wait() == 0
+    assert fitted("killed") == 3 and rows("killed") == rows("whole")
