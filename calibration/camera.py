@@ -77,7 +77,8 @@ class Camera:
         rays = np.column_stack([xy, np.ones(len(xy))])
         rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         if self.distortion.any():  # OpenCV answers even where its iteration diverged
-            error = np.linalg.norm(self.project(rays) - px, axis=1)
+            with np.errstate(over="ignore"):  # far beyond the tolerance
+                error = np.linalg.norm(self.project(rays) - px, axis=1)
             rays[~(error < _INVERSE_TOLERANCE_PX)] = np.nan
         return rays
 

@@ -34,6 +34,7 @@ from probnerf.environment import prepare
 
 Config = TypeVar("Config", ReplayConfig, Segmenting, LiveConfig, BatchConfig)
 
+_LONGEST = 1500  # characters of an error
 DESCRIPTION = """Farside: from one partial RGB-D view of an object, several whole, weighted shapes, and the probability
 that any space the camera cannot see is occupied. Lengths are in metres. --version prints the version; with --debug an
 error shows its traceback."""
@@ -54,6 +55,11 @@ SUMMARIES = {
     "train-network": str(NetworkTraining.__doc__),
     "bench": BENCH,
 }
+
+
+def _console(stderr: bool = False) -> Console:
+    """One that prints names of files and topics as they are: `[/x]` and `:x:` are no markup there."""
+    return Console(stderr=stderr, markup=False, emoji=False)
 
 
 def _configured(kind: type[Config], prog: str, args: Sequence[str]) -> Config:
@@ -80,14 +86,14 @@ def _replay(args: Sequence[str]) -> int:
     run = replay
     if config.schedule:
         from node.commands.replay_schedule import follow as run
-    return 0 if run(config, Console(), Console(stderr=True, markup=False)) else 130
+    return 0 if run(config, _console(), _console(stderr=True)) else 130
 
 
 def _segment(args: Sequence[str]) -> int:
     config = _configured(Segmenting, "farside segment", args)
     from node.commands.segment import segment_frame
 
-    segment_frame(config, Console(), Console(stderr=True, markup=False))
+    segment_frame(config, _console(), _console(stderr=True))
     return 0
 
 
@@ -95,7 +101,7 @@ def _live(args: Sequence[str]) -> int:
     config = _configured(LiveConfig, "farside live", args)
     from node.commands.live import live
 
-    live(config, Console(markup=False), Console(stderr=True, markup=False))
+    live(config, _console(), _console(stderr=True))
     return 0
 
 
@@ -103,14 +109,14 @@ def _batch(args: Sequence[str]) -> int:
     config = _configured(BatchConfig, "farside batch", args)
     from node.commands.batch import batch
 
-    return batch(config, Console(), Console(stderr=True, markup=False))
+    return batch(config, _console(), _console(stderr=True))
 
 
 def _record(args: Sequence[str]) -> int:
     options = tyro.cli(Record, args=args, prog="farside record")
     from node.commands.record import record
 
-    record(options, Console(), Console(stderr=True, markup=False))
+    record(options, _console(), _console(stderr=True))
     return 0
 
 
@@ -132,7 +138,7 @@ def _query(args: Sequence[str]) -> int:
     else:
         assert mesh is not None
         region = read_mesh(mesh, 0.5 * min(h.voxel_m for h in scene))
-    answer(scene, region, options.frame, options.risk, options.json, Console())
+    answer(scene, region, options.frame, options.risk, options.json, _console())
     return 0
 
 
@@ -145,15 +151,15 @@ def _view(args: Sequence[str]) -> int:
             raise ValueError("--out draws a file's picture; omit it with --live")
         from node.commands.view_live import watch
 
-        watch(options.live, options.node, options.port, options.token, Console(), Console(stderr=True, markup=False))
+        watch(options.live, options.node, options.port, options.token, _console(), _console(stderr=True))
         return 0
     from node.commands.view import draw, open_page
 
     assert options.file is not None
     if options.out is None:
-        open_page(options.file, options.port, options.token, Console(), Console(stderr=True, markup=False))
+        open_page(options.file, options.port, options.token, _console(), _console(stderr=True))
     else:
-        draw(options.file, options.out, Console(), Console(stderr=True, markup=False))
+        draw(options.file, options.out, _console(), _console(stderr=True))
     return 0
 
 
@@ -164,11 +170,11 @@ def _calibrate(args: Sequence[str]) -> int:
     from node.commands.calibrate import calibrate_camera, copy_camera, print_target
 
     if options.print_target is not None:
-        print_target(options.print_target, options.board, options.paper, Console())
+        print_target(options.print_target, options.board, options.paper, _console())
     elif options.from_ is not None:
-        copy_camera(options, options.from_, Console())
+        copy_camera(options, options.from_, _console())
     else:
-        calibrate_camera(options, Console(), Console(stderr=True, markup=False))
+        calibrate_camera(options, _console(), _console(stderr=True))
     return 0
 
 
@@ -176,7 +182,7 @@ def _hand_eye(args: Sequence[str]) -> int:
     options = tyro.cli(HandEyeOptions, args=args, prog="farside hand-eye")
     from node.commands.hand_eye import locate_camera
 
-    locate_camera(options, Console(), Console(stderr=True, markup=False))
+    locate_camera(options, _console(), _console(stderr=True))
     return 0
 
 
@@ -184,21 +190,21 @@ def _capture(args: Sequence[str]) -> int:
     options = tyro.cli(Capture, args=args, prog="farside capture")
     from node.commands.capture import capture
 
-    return 0 if capture(options, Console(), Console(stderr=True, markup=False)) else 130
+    return 0 if capture(options, _console(), _console(stderr=True)) else 130
 
 
 def _train(args: Sequence[str]) -> int:
     options = tyro.cli(Training, args=args, prog="farside train")
     from node.commands.train import train
 
-    return 0 if train(options, Console(), Console(stderr=True, markup=False)) else 130
+    return 0 if train(options, _console(), _console(stderr=True)) else 130
 
 
 def _train_network(args: Sequence[str]) -> int:
     options = tyro.cli(NetworkTraining, args=args, prog="farside train-network")
     from node.commands.train_network import train_network
 
-    return 0 if train_network(options, Console(), Console(stderr=True, markup=False)) else 130
+    return 0 if train_network(options, _console(), _console(stderr=True)) else 130
 
 
 def _bench(args: Sequence[str]) -> int:
@@ -261,14 +267,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         message = str(error)
         if isinstance(error, OSError) and error.filename is not None and message.startswith("[Errno"):
             message = f"{error.filename}: {error.strerror}; check this path, and that it may be read or written"
-        print(f"farside: error: {' '.join(message.split())}", file=sys.stderr)
+        print(f"farside: error: {_short(' '.join(message.split()))}", file=sys.stderr)
         return 1
     except Exception as error:  # a fault of this program, or input that no reader expected
         if "--debug" in arguments:
             raise
         what = "not enough memory" if isinstance(error, MemoryError) else f"{type(error).__name__}: {error}"
-        asked = " ".join([args[0], *(a for a in args[1:] if os.path.exists(a))])
-        what = " ".join(what.split())[:300]
+        asked = _short(" ".join([args[0], *(a for a in args[1:] if os.path.exists(a))]))
+        what = _short(" ".join(what.split()))
         print(f"farside: error: {asked}: {what}; check these files, or see more with --debug", file=sys.stderr)
         return 1
     except KeyboardInterrupt as error:
@@ -277,6 +283,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("farside: interrupted", file=sys.stderr)
         _UNFINISHED.append(error)
         return 130
+
+
+def _short(line: str) -> str:
+    """Its start and end, as a file may hold a name of any length."""
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
 
 
 # A Ctrl-C while jaxlib compiles leaves objects in its frames whose destruction may crash the process. Keep them.

@@ -125,7 +125,7 @@ class Worker:
         """The log's frame and objects. Raises `ValueError` naming the log, and `StoreError`."""
         if self._view is not None and self._view.log == log:
             return self._view
-        err = Console(file=io.StringIO())
+        err = Console(file=io.StringIO(), markup=False, emoji=False)
         with local_copy(log) as path:
             options = replace(self._job.config, source=path)
             try:

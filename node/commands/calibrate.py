@@ -46,9 +46,12 @@ def calibrate_camera(options: Calibrate, out: Console, err: Console) -> None:
     check_output(options.out)
     if options.every < 1:
         raise ValueError(f"--every is {options.every}; give 1 or more")
-    pictures, total = open_pictures(options.source)
+    notes: list[str] = []
+    pictures, total = open_pictures(options.source, notes)
     config = CalibrateConfig()
     found = find_views(pictures, board, err, total, options, config)
+    for note in notes:
+        err.print(f"note: {note}", highlight=False, soft_wrap=True)
     assert found.size is not None
     size, unseen = found.size, found.unseen
     views, same = distinct(found.views, size, config)

@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from foundation.whole_file import check_folder
 from node.commands.frame import read_frame, segments_of
@@ -164,7 +164,8 @@ def report(h: Hypotheses, out: Console, seconds: float | None = None, log: Seque
     `seconds` is the time of inference, `log` the reasons for the amount of model.
     """
     label = f" ({h.label})" if h.label else ""
-    out.print(f"[bold]object {h.object_id}{escape(label)}:[/] {answer(summarise(h))}", highlight=False, soft_wrap=True)
+    line = Text.assemble((f"object {h.object_id}{label}:", "bold"), f" {answer(summarise(h))}")
+    out.print(line, highlight=False, soft_wrap=True)
     table = Table.grid(padding=(0, 2))
     for name, value in figures(h).items():
         table.add_row(f"  {name}", value)

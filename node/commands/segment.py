@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from foundation.whole_file import check_folder, write_whole
 from node.commands.frame import read_frame, segments_of
@@ -30,7 +31,7 @@ def segment_frame(options: Segmenting, out: Console, err: Console) -> None:
     points = None if frame.depth is None else backproject(frame)
     for segment in found:
         pixels = f"{int(segment.mask.sum())} px"
-        table.add_row(f"[bold]object {segment.id}[/]", pixels, *_seen(segment, frame, points))
+        table.add_row(Text(f"object {segment.id}", "bold"), pixels, *_seen(segment, frame, points))
     out.print(table, highlight=False)
     label = np.zeros(frame.rgb.shape[:2], np.uint16)
     for segment in found:

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from perception.observation.camera_check import check_camera
 from perception.observation.colour_masks import label_colour
 from perception.observation.depth_scale import scale_doubt
 from perception.observation.depth_shadows import by_colour
@@ -82,30 +83,18 @@ def segment(frame: Frame, object_id: int | None = None, config: SegmentConfig | 
     Without depth, pixels outside the mask and its rim are FREE, except other masks that may belong to things in front
     of the object. Pixels in no mask count as behind it.
 
-    Raises `ValueError` if there is no plane, no such id, no object, a mask of a few pixels, or the principal point is
-    outside of the picture.
+    Raises `ValueError` if there is no plane, no such id, no object, a mask of a few pixels, or intrinsics that
+    cannot be those of the picture.
     """
     config = config or SegmentConfig()
     try:
         if config.whole:
-            _check_camera(frame)
+            check_camera(frame.camera)
         if frame.depth is None:
             return Segments(tuple(_segment_colour(frame, object_id, config)))
         return _segment_depth(frame, object_id, config)
     except ValueError as error:
         raise ValueError(f"frame at {frame.stamp_ns} ns: {error}") from None
-
-
-def _check_camera(frame: Frame) -> None:
-    """Raises `ValueError` for intrinsics of another resolution."""
-    camera = frame.camera
-    cx, cy = camera.K[0, 2], camera.K[1, 2]
-    if not (0 <= cx <= camera.width and 0 <= cy <= camera.height):
-        raise ValueError(
-            f"the camera's principal point ({cx:.0f}, {cy:.0f}) is outside of the picture of"
-            f" {camera.width}x{camera.height} px: its matrix is of another resolution; scale it to this one, or"
-            " calibrate at this size"
-        )
 
 
 def _segment_depth(frame: Frame, object_id: int | None, config: SegmentConfig) -> Segments:

@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32, Int32, Shaped, UInt8
 from calibration.camera import Camera
 
 SATURATED = 65535  # depth count of 16 bits
+LAST_STAMP = 2**31 * 10**9  # ns; ROS counts its seconds in 32 bits
 
 _FARTHEST_MEDIAN = 200.0  # m
 
@@ -19,7 +20,7 @@ class Frame:
     """One picture with its camera. Colour, depth and label share pixels.
 
     `camera` may be given as its 3x3 matrix K (px; pixel centres at whole numbers), for a lens without distortion.
-    Raises `ValueError` if sizes or types do not fit.
+    Raises `ValueError` if sizes, types or the stamp do not fit.
     """
 
     rgb: UInt8[np.ndarray, "h w 3"]
@@ -50,6 +51,11 @@ class Frame:
             raise ValueError(
                 f"the camera is calibrated at {camera.width}x{camera.height} px but colour is"
                 f" {width}x{height} px; use the calibration of this image size"
+            )
+        if not 0 <= stamp_ns < LAST_STAMP:
+            raise ValueError(
+                f"the stamp is {stamp_ns} ns; give nanoseconds since 1970, from 0 to {LAST_STAMP}: set the clock that"
+                " stamps the images"
             )
         if depth is not None:  # a sensor's zero or infinity is no distance
             depth = _plane("depth", depth, np.float32, rgb)

@@ -11,14 +11,13 @@ from jaxtyping import Float
 from calibration.camera import Camera
 from foundation.bounded import check_size, parse_json
 from foundation.whole_file import write_whole
-from perception.sources.frame import SATURATED, Frame, known_counts
+from perception.sources.frame import LAST_STAMP, SATURATED, Frame, known_counts
 from perception.sources.image_files import read_npy, read_picture, read_png
 from perception.sources.label_map import read_label_map
 from perception.sources.registration import registered
 from probnerf.geometry import rigid
 
 DEPTH_UNIT_M = 1e-4  # of the depth.png that is written; 1 mm where that does not reach far enough
-LAST_STAMP = 2**31 * 10**9  # ns; ROS counts its seconds in 32 bits
 # Keys of meta.json, and their shapes, for the camera's K_std, distortion_std and rms.
 _DEVIATIONS: dict[str, tuple[int, ...]] = {"camera_matrix_std_px": (3, 3), "distortion_std": (-1,), "rms_px": ()}
 COLOURS = ("color.png", "color.jpg", "color.jpeg", "rgb.png", "rgb.jpg", "rgb.jpeg")  # the first one that exists

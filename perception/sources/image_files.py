@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 
 from foundation.bounded import check_arrays
+from probnerf.environment import MOST_PIXELS
 
 _PNG_MAGIC, _JPEG_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-LARGEST = 1 << 26  # values of an array, or pixels of a PNG
+LARGEST = MOST_PIXELS  # and values of an array
 
 
 def read_png(path: Path) -> Shaped[np.ndarray, "h w *c"]:
@@ -116,6 +117,8 @@ def decoded(data: bytes) -> Shaped[np.ndarray, "h w *c"]:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     except cv2.error as error:
+        if "IO_MAX_IMAGE" in error.err:
+            raise ValueError(f"it says that it is larger than {LARGEST} pixels") from None
         raise ValueError(f"OpenCV: {error.err}") from None
     if image is None:
         raise ValueError("it is no picture, or damaged")

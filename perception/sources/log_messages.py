@@ -88,7 +88,7 @@ def open_log(path: Path) -> tuple[Read, dict[str, str], list[str]]:
                 wanted = [c for c in reader.connections if c.topic in topics]
                 for connection, time, raw in reader.messages(wanted) if wanted else ():
                     kind = connection.msgtype
-                    with lost.counted(connection.topic):
+                    with lost.counted(connection.topic, kind):
                         message: Any = reader.deserialize(raw, kind)
                         if lacks := _fields(kind) - {name.lower() for name in message.__dataclass_fields__}:
                             raise ValueError(f"its definition of {kind} lacks {', '.join(sorted(lacks))}")
@@ -116,32 +116,32 @@ def open_log(path: Path) -> tuple[Read, dict[str, str], list[str]]:
 
 
 class _Lost:
-    """Messages that cannot be read: they cost themselves, with a note; but not all of a topic may be lost."""
+    """Messages that cannot be read: they cost themselves, with a note; but not all of a message type may be lost."""
 
     def __init__(self, path: Path, notes: list[str]) -> None:
         self.this_one = False
         self._path, self._notes = path, notes
-        self._good: Counter[str] = Counter()
-        self._bad: dict[str, str] = {}  # why, by topic
+        self._good: set[str] = set()  # message types
+        self._bad: dict[str, tuple[str, str]] = {}  # type and why, by topic
 
     @contextmanager
-    def counted(self, topic: str) -> Iterator[None]:
+    def counted(self, topic: str, kind: str) -> Iterator[None]:
         """Read one message within."""
         self.this_one = False
         try:
             yield
-            self._good[topic] += 1
+            self._good.add(kind)
         except Exception as error:
             self.this_one = True
-            self._bad.setdefault(topic, one_line(error))
-            note = f"{self._path.name}: messages on {topic} that cannot be read are left out ({self._bad[topic]})"
+            _, why = self._bad.setdefault(topic, (kind, one_line(error)))
+            note = f"{self._path.name}: messages on {topic} that cannot be read are left out ({why})"
             if note not in self._notes:
                 self._notes.append(note)
 
     def refuse_all(self) -> None:
-        """Raises ValueError for a topic of which nothing could be read."""
-        for topic, why in self._bad.items():
-            if topic not in self._good:
+        """Raises ValueError for a type of which nothing could be read: its definition is damaged, or its only topic."""
+        for kind, why in self._bad.values():
+            if kind not in self._good:
                 raise ValueError(why)
 
 
@@ -206,7 +206,7 @@ def _open_cut(whole: Path, paths: list[Path], notes: list[str]) -> tuple[Read, d
         for path in paths:
             for topic, kind, raw in records(path):
                 if topic in topics:
-                    with lost.counted(topic):
+                    with lost.counted(topic, kind):
                         message = _TYPES.deserialize_cdr(raw.data, kind)
                     if not lost.this_one:
                         yield Received(topic, kind, raw.log_time, message)

@@ -36,8 +36,8 @@ def pictures_of(frames: Iterable[Frame]) -> Iterator[Picture]:
         yield Picture(f"frame {number}", frame.rgb)
 
 
-def open_pictures(source: Path | str) -> tuple[Iterator[Picture], int | None]:
-    """The pictures of `source` and their number; None for those of a stream.
+def open_pictures(source: Path | str, notes: list[str] | None = None) -> tuple[Iterator[Picture], int | None]:
+    """The pictures of `source` and their number; None for those of a stream. What a recording lacks goes to `notes`.
 
     `source` is a folder of images (in the order of their names), one image, a recording with a colour image (its
     camera_info, depth and labels are not read), the calibrationdata.tar.gz of ROS's cameracalibrator (its left-*.png;
@@ -62,7 +62,7 @@ def open_pictures(source: Path | str) -> tuple[Iterator[Picture], int | None]:
         files = [path] if path.suffix.lower() in _ENDINGS else []
     if files:
         return (Picture(file.name, _read_image(file)) for file in files), len(files)
-    return _logged(path), None
+    return _logged(path, [] if notes is None else notes), None
 
 
 def _newest(source: Source) -> Iterator[Picture]:
@@ -79,15 +79,27 @@ def _archived(path: Path, camera: str) -> tuple[Iterator[Picture], int]:
     return (Picture(name, _colours(f"{path}: {name}", data)) for name, data in members(path, wanted)), count
 
 
-def _logged(path: Path) -> Iterator[Picture]:
-    read, kinds, _ = open_log(path)
+def _logged(path: Path, notes: list[str]) -> Iterator[Picture]:
+    read, kinds, lacks = open_log(path)
     firsts = first_messages(read, {topic: kind for topic, kind in kinds.items() if kind in _IMAGES})
-    topic, _ = colour_topic(path, {name: first.message for name, first in firsts.items()})
+    try:
+        topic, others = colour_topic(path, {name: first.message for name, first in firsts.items()})
+    except ValueError as error:
+        raise ValueError("; ".join([str(error), *lacks])) from None
+    good, broken = 0, list[str]()
     for number, received in enumerate(read({topic})):
         try:
-            yield Picture(f"frame {number}", to_rgb(received.message))
+            picture = Picture(f"frame {number}", to_rgb(received.message))
         except ValueError as error:
-            raise ValueError(f"{path}: frame {number} of {topic}: {error}") from None
+            broken.append(f"{path}: frame {number} of {topic}: {error}")
+            continue
+        good += 1
+        yield picture
+    if broken and not good:
+        raise ValueError(broken[0])
+    notes += [*others, *lacks]
+    if broken:
+        notes.append(f"pictures that cannot be read left out: {len(broken)}; the first: {broken[0]}")
 
 
 def _read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:

@@ -190,10 +190,8 @@ class Recorder:
     def _fail(self, error: Exception) -> None:
         reason = getattr(error, "strerror", None) or one_line(error)
         remedy = "make room or record elsewhere" if isinstance(error, OSError) else "the disk is not the cause"
-        self.error = (
-            f"{self.path}: recording ended at frame {self.frames} ({reason}); {remedy}; what was written before can be"
-            " read"
-        )
+        kept = "; what was written before can be read" if self.frames else ""
+        self.error = f"{self.path}: recording ended at frame {self.frames} ({reason}); {remedy}{kept}"
         if self._on_error is not None:
             self._on_error(self.error)
 

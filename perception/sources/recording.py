@@ -66,10 +66,9 @@ class Log:
             chosen = choose(self.path, images, infos, names or TopicNames())
         except ValueError as error:
             others = [f"{topic} ({kind})" for topic, kind in kinds.items() if kind.endswith(_NOT_READ)]
-            if not others:
-                raise
-            what = "video packets and Foxglove's images are not read"
-            raise ValueError(f"{error}; {what}: {', '.join(others)}") from None
+            if others:
+                error = ValueError(f"{error}; video packets and Foxglove's images are not read: {', '.join(others)}")
+            raise ValueError("; ".join([str(error), *self._notes])) from None
         self.colour_topic, self.depth_topic, self.label_topic = chosen.colour, chosen.depth, chosen.label
         self.info_topic = chosen.info
         self._notes += chosen.notes
@@ -79,10 +78,8 @@ class Log:
         elif self.info_topic is not None:
             self._first_camera = self._camera(firsts[self.info_topic])
         else:
-            raise ValueError(
-                f"{self.path} has no camera_info; record the camera_info topic beside {self.colour_topic}, or give a"
-                " camera file (--camera)"
-            )
+            why = f"{self.path} has no camera_info; record the camera_info topic beside {self.colour_topic}, or give a"
+            raise ValueError("; ".join([f"{why} camera file (--camera)", *self._notes]))
         self._pose_topic = POSE_TOPIC if kinds.get(POSE_TOPIC) == "geometry_msgs/msg/PoseStamped" else None
         paired = [topic for topic in (chosen.colour, chosen.depth, chosen.label) if topic]
         unstamped = [topic for topic in paired if not stamp_ns(firsts[topic].message)]

@@ -1,5 +1,7 @@
 """A CameraInfo message as the camera of the image that it is published with."""
 
+import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -7,7 +9,7 @@ from jaxtyping import Float
 
 from calibration.camera import DISTORTION_LENGTHS, Camera
 
-# Drivers' names of lens models, in small letters without spaces and underscores, by ROS's own.
+# Drivers' names of lens models, in small letters and nothing between them, by ROS's own.
 _MODELS = {
     "plumb_bob": ("plumbbob", "", "none", "brownconrady", "modifiedbrownconrady", "radtan", "radialtangential"),
     "rational_polynomial": ("rationalpolynomial", "rational"),
@@ -34,7 +36,7 @@ def to_camera(info: Any, rectified: bool) -> Camera:
         return _of_image(info, P.reshape(3, 4)[:, :3], np.zeros(_BROWN), "plumb_bob")
     if rectified:  # a driver that leaves P empty publishes what needs no other matrix
         return _of_image(info, K, np.zeros(_BROWN), "plumb_bob")
-    name = info.distortion_model.lower().replace(" ", "").replace("_", "")
+    name = re.sub("[ _-]", "", info.distortion_model.lower())
     model = _NAMES.get(name, info.distortion_model)
     if not D.any():  # no distortion, whatever the model's name; a fisheye without is one still
         if len(D) not in DISTORTION_LENGTHS.get(model, ()):
@@ -43,13 +45,17 @@ def to_camera(info: Any, rectified: bool) -> Camera:
         return _of_image(info, K, D, model)
     if name == "inversebrownconrady" and np.isfinite(D).all() and min(K[0, 0], K[1, 1]) > 0:
         return _of_image(info, K, _inverted(K, D, info.width, info.height), "plumb_bob")
-    if model == "rational_polynomial" and len(D) < _RATIONAL:  # the last coefficients are zero
-        D = np.pad(D, (0, _RATIONAL - len(D)))
-    elif model == "plumb_bob" and len(D) >= _RATIONAL:
+    if model == "plumb_bob" and len(D) >= _RATIONAL:
         model = "rational_polynomial"
-    elif model == "equidistant" and not D[4:].any():  # some drivers fill up with zeros
-        D = D[:4]
-    return _of_image(info, K, D, model)
+    return _of_image(info, K, _filled(D, DISTORTION_LENGTHS.get(model, ())), model)
+
+
+def _filled(D: Float[np.ndarray, "d"], lengths: Sequence[int]) -> Float[np.ndarray, "d"]:
+    """The coefficients in the next length that the model has; drivers leave the last zeros out, or add some."""
+    if len(D) in lengths:
+        return D
+    D = np.trim_zeros(D, "b")
+    return np.pad(D, (0, next((n - len(D) for n in lengths if n >= len(D)), 0)))
 
 
 def _inverted(

@@ -29,6 +29,7 @@ _YUV = {  # by OpenCV's codes
 COLOURS = _STRAIGHT | _BAYER | {name: ("u1", 1 if name.startswith("nv") else 2) for name in _YUV}
 _ENCODINGS = COLOURS | {"8UC1": ("u1", 1), "mono16": ("u2", 1), "16UC1": ("u2", 1), "32FC1": ("f4", 1)}
 _ENCODINGS |= {"32SC1": ("i4", 1)}  # labels
+_SPELT = {name.lower(): name for name in _ENCODINGS}  # drivers write BGR8, YUYV and NV12, too
 
 
 def stamp_ns(message: Any) -> int:
@@ -37,14 +38,16 @@ def stamp_ns(message: Any) -> int:
 
 
 def encoding_of(message: Any) -> str:
-    """The encoding of the pixels; of a CompressedImage what its format says before ';', else what its PNG says, else
-    bgr8 ("jpeg").
+    """The encoding of the pixels, as ROS spells it; of a CompressedImage what its format says before ';', else 16UC1
+    for compressedDepth, else what its PNG says, else bgr8 ("jpeg").
     """
     if hasattr(message, "encoding"):
-        return message.encoding
-    first = message.format.split(";")[0].strip()
-    if first in _ENCODINGS:
-        return first
+        return _SPELT.get(message.encoding.lower(), message.encoding)
+    first = message.format.split(";")[0].strip().lower()
+    if first in _SPELT:
+        return _SPELT[first]
+    if "compressedDepth" in message.format:
+        return "16UC1"
     start = bytes(message.data[:26])
     if start.startswith(b"\x89PNG") and len(start) == 26 and start[25] == 0:  # a PNG of one channel
         return "16UC1" if start[24] == 16 else "mono8"
@@ -53,7 +56,7 @@ def encoding_of(message: Any) -> str:
 
 def to_rgb(message: Any) -> UInt8[np.ndarray, "h w 3"]:
     """A colour image. Raises `ValueError` if the message does not hold one."""
-    encoding = message.encoding if hasattr(message, "encoding") else ""
+    encoding = encoding_of(message) if hasattr(message, "encoding") else ""
     image = _whole(message) if encoding.startswith("nv") else samples(message)
     if image.dtype == np.uint16 and (encoding in COLOURS or image.ndim == 3):
         image = (image >> 8).astype(np.uint8)
@@ -113,7 +116,7 @@ def samples(message: Any) -> Shaped[np.ndarray, "h w *c"]:
 
 def _whole(message: Any) -> Shaped[np.ndarray, "h w *c"]:
     """The samples of a raw image; of nv12 and nv21 with the rows of colour, half as many, below."""
-    data, encoding = np.asarray(message.data, dtype=np.uint8), message.encoding
+    data, encoding = np.asarray(message.data, dtype=np.uint8), encoding_of(message)
     if encoding not in _ENCODINGS:
         raise ValueError(f"encoding {encoding!r} is not read; record rgb8, bgr8, bayer, yuv422, nv12, 16UC1 or 32FC1")
     sample, channels = _ENCODINGS[encoding]

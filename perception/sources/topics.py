@@ -73,7 +73,7 @@ def colour_topic(path: Path, firsts: Mapping[str, Any], name: str | None = None)
     `name` is the requested topic.
     """
     encodings = {t: encoding_of(message) for t, message in firsts.items()}
-    found = [t for t, e in encodings.items() if e in COLOURS and (t == name or _is_picture(t, e))]
+    found = [t for t, e in encodings.items() if (e in COLOURS and t == name) or _is_picture(t, e)]
     if not found or (name is not None and name not in found):
         seen = ", ".join(f"{t} ({encoding_of(message)})" for t, message in firsts.items()) or "none"
         what = "no colour image" if name is None else f"no colour image on {name}"
@@ -141,7 +141,9 @@ def _no_labels(message: Any, colour: Any) -> str | None:
 
 
 def _is_picture(topic: str, encoding: str) -> bool:
-    """Whether a topic's name allows colour. Of what has colours for certain, only its own name counts."""
+    """Whether a topic's name and encoding allow colour. Of what has colours for certain, only its own name counts."""
+    if encoding not in COLOURS or topic.endswith("/compressedDepth"):
+        return False
     whole = name_parts(topic)
     if encoding == "mono8":
         return not (_LABEL_PARTS | _NO_PICTURE_PARTS) & whole or bool(_COLOUR_PARTS & whole)
@@ -195,10 +197,14 @@ def _depth_topic(path: Path, images: Mapping[str, Any], colour: str, name: str |
 
 def _named_depth(path: Path, images: Mapping[str, Any]) -> tuple[list[str], list[str]]:
     """The topics whose name or transport says depth, and notes on those that might be."""
-    found, unnamed = [], []
+    found, unnamed, unread = [], [], []
     for topic, message in images.items():
         parts, encoding = name_parts(topic), encoding_of(message)
-        if encoding not in ("16UC1", "mono16", "32FC1") or parts & (_LABEL_PARTS | NO_DEPTH_PARTS):
+        if parts & (_LABEL_PARTS | NO_DEPTH_PARTS):
+            continue
+        if encoding not in ("16UC1", "mono16", "32FC1"):
+            if "depth" in parts and not _is_picture(topic, encoding):
+                unread.append(f"{topic} ({getattr(message, 'format', encoding)!r})")
             continue
         own = name_parts(" ".join(_segments(topic)[-2:]))  # a depth camera's other images have its name, too
         if own & _INFRARED_PARTS and "depth" not in own:
@@ -207,10 +213,14 @@ def _named_depth(path: Path, images: Mapping[str, Any]) -> tuple[list[str], list
             found.append(topic)
         elif encoding != "mono16" and not parts & _INFRARED_PARTS:
             unnamed.append(f"{topic} ({encoding})")
-    if found or not unnamed:
-        return found, []
-    note = f"{path.name}: {', '.join(unnamed)} may be depth, but no part of the name says depth, so it is not used"
-    return found, [f"{note}; if it is, choose it with --depth-topic"]
+    notes = []
+    if unread:
+        what = f"{path.name}: {', '.join(unread)} is not read as depth"
+        notes.append(f"{what}; record millimetres as 16UC1 or metres as 32FC1")
+    if unnamed:
+        note = f"{path.name}: {', '.join(unnamed)} may be depth, but no part of the name says depth, so it is not used"
+        notes.append(f"{note}; if it is, choose it with --depth-topic")
+    return found, [] if found else notes
 
 
 def _info_topic(path: Path, infos: Mapping[str, Any], images: Mapping[str, Any], colour: str) -> str | None:

@@ -277,11 +277,11 @@ def test_log_times_rise_where_the_cameras_clock_jumps_back(tmp_path: Path) -> No
     assert "stamps jump back by 9.97 s" in log.notes[-1]
 
 
-def test_a_stamp_that_no_message_holds_is_no_matter_of_room(tmp_path: Path) -> None:
+def test_a_name_that_no_message_holds_is_no_matter_of_room(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with Recorder(path, wait=True) as recorder:
         recorder.write_frame(frame(0))
-        recorder.write_frame(replace(frame(1), stamp_ns=2**62))
+        recorder.write_frame(replace(frame(1), frame_id="\udcff"))
     assert recorder.error is not None and "the disk is not the cause" in recorder.error
     assert "make room" not in recorder.error and len(list(Log(path))) == 1
 
