@@ -49,9 +49,13 @@ class Camera:
         if distortion.size not in lengths or not np.isfinite(distortion).all():
             wanted = " or ".join(map(str, lengths))
             raise ValueError(f"distortion {distortion.tolist()} does not fit {model}: {wanted} finite numbers wanted")
-        for name in ("K_std", "distortion_std", "rms"):
-            if (values := getattr(self, name)) is not None and not (np.asarray(values, np.float64) >= 0).all():
-                raise ValueError(f"{name} is {np.asarray(values).tolist()}; deviations are 0 or more")
+        for name, of in (("K_std", K), ("distortion_std", distortion), ("rms", np.zeros(()))):
+            if (values := getattr(self, name)) is None:
+                continue
+            values = np.asarray(values, np.float64)
+            if values.shape != of.shape or not (values >= 0).all():
+                shape = "x".join(map(str, of.shape)) or "one"
+                raise ValueError(f"{name} is {values.tolist()}; deviations are {shape} numbers, 0 or more")
         object.__setattr__(self, "model", model)
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "distortion", distortion)

@@ -15,8 +15,7 @@ from calibration.camchain import camera_of_chain, is_chain
 from calibration.camera import Camera
 from calibration.projection import Projection
 from foundation.archive import is_archive, members
-from foundation.bounded import check_size
-from foundation.one_line import one_line
+from foundation.bounded import parse_yaml, read_text
 from foundation.whole_file import write_whole
 
 # ROS's reader ignores this key.
@@ -78,12 +77,11 @@ def read_camera(path: Path) -> Camera:
     path, name = split_name(path)
     archived = _archived(path, name) if is_archive(path) else None
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8") if archived is None else archived.decode())
-        check_size(content)
+        content = parse_yaml(read_text(path) if archived is None else archived.decode())
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise FileNotFoundError(f"{path}: no such camera file; `farside calibrate` writes one") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is not YAML ({one_line(error)}); calibrate again") from None
+    except ValueError as error:
+        raise ValueError(f"{path} is not YAML ({error}); calibrate again") from None
     if is_chain(content):
         try:
             return camera_of_chain(content, name)
@@ -107,7 +105,8 @@ def read_camera(path: Path) -> Camera:
             rms=None if rms is None else float(rms),
         )
     except (AttributeError, OverflowError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is no camera file: {error}; calibrate again") from None
+        why = str(error).removesuffix("; calibrate again")
+        raise ValueError(f"{path} is no camera file: {why}; calibrate again") from None
 
 
 def _archived(path: Path, name: str | None) -> bytes:
@@ -127,10 +126,10 @@ def _array(content: Mapping, key: str) -> np.ndarray:
     entry = content.get(key)
     if not isinstance(entry, Mapping) or not {"rows", "cols", "data"} <= set(entry):
         raise ValueError(f"{key} is {entry!r}, not rows, cols and data")
-    data = np.array(entry["data"], dtype=np.float64)
-    if data.size != entry["rows"] * entry["cols"]:
-        raise ValueError(f"{key} has {data.size} numbers for {entry['rows']}x{entry['cols']}")
-    return data.reshape(entry["rows"], entry["cols"])
+    data, size = np.array(entry["data"], dtype=np.float64), (_whole(entry, "rows"), _whole(entry, "cols"))
+    if min(size) < 1 or data.size != size[0] * size[1]:
+        raise ValueError(f"{key} has {data.size} numbers for {size[0]}x{size[1]}")
+    return data.reshape(size)
 
 
 def _whole(content: Mapping, key: str) -> int:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from calibration.hand_eye import HandEye
-from foundation.bounded import check_size, parse_json
+from foundation.bounded import check_size, parse_json, parse_yaml, read_text
 from foundation.one_line import one_line
 from foundation.whole_file import write_whole
 
@@ -20,7 +20,6 @@ Matrix = Float[np.ndarray, "4 4"]
 _FORMS = "x y z qx qy qz qw (metres; quaternion with w last) of T_base_gripper, perhaps after the picture's name"
 _COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _NAMES = ("picture", "image", "file", "filename", "name", "timestamp", "time", "stamp")
-_LARGEST = 1 << 24  # bytes of a file of poses
 _FAR = 100.0  # m; farther is millimetres
 
 
@@ -41,13 +40,13 @@ def read_robot_poses(path: Path) -> list[RobotPose]:
     it), of 7 numbers, or of 4x4 matrices. Raises FileNotFoundError, or ValueError naming the file and the entry.
     """
     try:
-        if path.stat().st_size > _LARGEST:
-            raise ValueError(f"{path} has {path.stat().st_size >> 20} MB; give a file of poses: {_FORMS}")
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path)
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise FileNotFoundError(f"{path}: no such file; give one of {_FORMS}") from None
     except UnicodeDecodeError:
         raise ValueError(f"{path} is no text; give a file of {_FORMS}") from None
+    except ValueError as error:
+        raise ValueError(f"{path} is no file of poses: {error}; give {_FORMS}") from None
     entries = _structured(path, text) if path.suffix.lower() in (".json", ".yaml", ".yml") else _rows(path, text)
     poses: list[RobotPose] = []
     for name, entry in entries:
@@ -100,9 +99,9 @@ def _is_number(text: str) -> bool:
 
 def _structured(path: Path, text: str) -> list[tuple[str | None, Any]]:
     try:
-        content = parse_json(text) if path.suffix.lower() == ".json" else yaml.safe_load(text)
+        content = parse_json(text) if path.suffix.lower() == ".json" else parse_yaml(text)
         check_size(content)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except ValueError as error:
         raise ValueError(f"{path} cannot be read ({one_line(error)[:200]}); give {_FORMS}") from None
     if isinstance(content, Mapping) and len(content) == 1 and isinstance(inner := next(iter(content.values())), list):
         content = inner  # poses: [...]
@@ -199,13 +198,12 @@ def write_hand_eye(path: Path, result: HandEye, parent: str, camera: str) -> Non
 def read_mounting(path: Path) -> Mounting:
     """The camera's place in a file that `write_hand_eye` wrote. Raises FileNotFoundError, or ValueError naming it."""
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        check_size(content)
+        content = parse_yaml(read_text(path))
         parent, camera = content["header"]["frame_id"], content["child_frame_id"]
         T = _of_parts(content["transform"])
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise FileNotFoundError(f"{path}: no such file; `farside hand-eye` writes one") from None
-    except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{path} is no result of `farside hand-eye` ({one_line(error)[:200]}); run it again") from None
     for name in (parent, camera):
         if not isinstance(name, str) or not name:

@@ -8,11 +8,58 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from foundation.one_line import one_line
 
 MOST_VALUES = 100_000  # of a parsed text; aliases of YAML count as often as they are used
 LARGEST_ARRAY = 1 << 30  # bytes
+LARGEST_YAML = 1 << 18  # bytes of text, which take seconds
+_LARGEST_TEXT = 1 << 24
+_MOST_LEVELS = 100
+
+
+def read_text(path: Path, most: int = _LARGEST_TEXT) -> str:
+    """The text of a file of at most `most` bytes; no more of it is read. Raises OSError, ValueError for another."""
+    with path.open("rb") as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise ValueError(f"it has more than {most >> 10} kB")
+    return data.decode("utf-8-sig")
+
+
+def check_nesting(text: str) -> None:
+    """Raises ValueError for YAML that is nested deeper than `_MOST_LEVELS`, before any of it is built."""
+    depth = 0
+    for event in yaml.parse(text, yaml.SafeLoader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > _MOST_LEVELS:
+            raise ValueError("it is nested too deep")
+
+
+class _Loader(yaml.SafeLoader):
+    """Merge keys (<<) are copied when they are read: repeated, they multiply."""
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        super().flatten_mapping(node)
+        if len(node.value) > MOST_VALUES:
+            raise ValueError(f"it holds more than {MOST_VALUES} values, merged keys counted")
+
+
+def parse_yaml(text: str) -> Any:
+    """The content of a text in YAML 1.1, as ROS and its tools write it.
+
+    Raises ValueError for what is none, is too large or is nested too deep.
+    """
+    try:
+        if len(text) > LARGEST_YAML:
+            raise ValueError(f"it has more than {LARGEST_YAML >> 10} kB")
+        check_nesting(text)
+        content = yaml.load(text, _Loader)
+        check_size(content)
+    except Exception as error:  # tags that do not fit (`!!bool x`) fail in many ways
+        raise ValueError(one_line(error)) from None
+    return content
 
 
 def parse_json(text: str | bytes) -> Any:

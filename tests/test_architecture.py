@@ -115,7 +115,8 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "dask": ("node/commands/batch_dask.py",),  # the extra `cluster`, imported when it is asked for
     "distributed": ("node/commands/batch_dask.py", "benchmarks/studies/batch.py"),
     "mcap": ("perception/sources/log_messages.py", "perception/sources/recorder.py"),
-    "yaml": ("calibration/camera_file.py", "calibration/pose_files.py"),  # which ROS and its tools write as YAML 1.1
+    # YAML 1.1, as ROS and its tools write it
+    "yaml": ("foundation/bounded.py", "calibration/camera_file.py", "calibration/pose_files.py"),
     # launch files: YAML 1.2 (1e-3 is a number), no key twice; then into dataclasses
     "ruamel": ("node/commands/config_file.py",),
     "pydantic": ("node/commands/config_file.py",),

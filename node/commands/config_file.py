@@ -14,10 +14,9 @@ from typing import Any, TypeVar, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 from ruamel.yaml import YAML
-from ruamel.yaml.constructor import DuplicateKeyError
-from ruamel.yaml.error import YAMLError
+from ruamel.yaml.constructor import DuplicateKeyError, SafeConstructor
 
-from foundation.bounded import check_size
+from foundation.bounded import LARGEST_YAML, MOST_VALUES, check_nesting, check_size, read_text
 from foundation.one_line import one_line
 
 T = TypeVar("T")
@@ -33,13 +32,26 @@ _REMEDIES = {
 }
 
 
+class _Constructor(SafeConstructor):
+    """Merge keys (<<) are copied when they are read: repeated, they multiply."""
+
+    def flatten_mapping(self, node: Any) -> None:
+        super().flatten_mapping(node)
+        if len(node.value) > MOST_VALUES:
+            raise ValueError(f"it holds more than {MOST_VALUES} values, merged keys counted")
+
+
 def load_config(path: Path, into: type[T]) -> T:
     """The dataclass `into` filled from a YAML file.
 
     Raises FileNotFoundError, or ValueError naming the file, the key and the remedy.
     """
     try:
-        values = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+        loader = YAML(typ="safe", pure=True)
+        loader.Constructor = _Constructor
+        text = read_text(path, LARGEST_YAML)
+        check_nesting(text)  # ruamel takes minutes
+        values = loader.load(text)
         check_size(values)
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise FileNotFoundError(f"{path}: no such configuration file; see launch/replay.yaml for one") from None
@@ -47,7 +59,7 @@ def load_config(path: Path, into: type[T]) -> T:
         assert error.problem is not None and error.problem_mark is not None
         where = f"line {error.problem_mark.line + 1}: {error.problem}"
         raise ValueError(f"{path} is not YAML ({where}; omit one of them)") from None
-    except (YAMLError, ValueError, RecursionError) as error:
+    except Exception as error:  # tags that do not fit (`!!bool x`) fail in many ways
         raise ValueError(f"{path} is not YAML ({one_line(error)})") from None
     try:
         return from_mapping(into, {} if values is None else values)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, Shaped, UInt8
 
 from calibration.camera import Camera
+from probnerf.geometry import rigid
 
 SATURATED = 65535  # depth count of 16 bits
 LAST_STAMP = 2**31 * 10**9  # ns; ROS counts its seconds in 32 bits
@@ -20,7 +21,7 @@ class Frame:
     """One picture with its camera. Colour, depth and label share pixels.
 
     `camera` may be given as its 3x3 matrix K (px; pixel centres at whole numbers), for a lens without distortion.
-    Raises `ValueError` if sizes, types or the stamp do not fit.
+    Raises `ValueError` if sizes, types, the stamp or the pose do not fit.
     """
 
     rgb: UInt8[np.ndarray, "h w 3"]
@@ -57,6 +58,8 @@ class Frame:
                 f"the stamp is {stamp_ns} ns; give nanoseconds since 1970, from 0 to {LAST_STAMP}: set the clock that"
                 " stamps the images"
             )
+        if T_world_camera is not None and not (np.shape(T_world_camera) == (4, 4) and rigid(T_world_camera)):
+            raise ValueError(f"T_world_camera {T_world_camera} is no rotation with a translation (m) beside it")
         if depth is not None:  # a sensor's zero or infinity is no distance
             depth = _plane("depth", depth, np.float32, rgb)
             _check_metres(depth)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from perception.sources.frame import Frame
+from perception.sources.frame import Frame, known_counts
 from perception.sources.image_files import read_npz
 from perception.sources.label_map import NAMES as LABELS
 from perception.sources.label_map import as_labels
@@ -29,12 +29,16 @@ def read_frame_arrays(path: Path) -> Frame:
     if rgb is None or K is None:
         missing = "rgb" if rgb is None else "K"
         raise ValueError(f"{path} has no array {missing}; a frame has rgb, depth (m), K and perhaps segmap")
-    if rgb.dtype.kind == "f" and rgb.size and 0.0 <= np.nanmin(rgb) and np.nanmax(rgb) <= 1.0:
+    if rgb.dtype.kind == "f" and ((rgb >= 0.0) & (rgb <= 1.0)).all():
         rgb = np.rint(255.0 * rgb).astype(np.uint8)
     if depth is not None:
         depth = np.squeeze(depth)
+        if depth.dtype.itemsize == 1:
+            raise ValueError(f"{path}: depth holds {depth.dtype}; save metres, or millimetres in 16 bits")
         if depth.dtype.kind in "iu":  # as in depth images (REP 118)
-            depth = depth.astype(np.float32) * np.float32(1e-3)
+            depth = known_counts(depth).astype(np.float32) * np.float32(1e-3)
+    if rgb.ndim != 3:
+        raise ValueError(f"{path}: rgb is {list(rgb.shape)}; give height x width x 3")
     if K.shape != (3, 3) or (pose is not None and pose.shape != (4, 4)):
         raise ValueError(f"{path}: K is {list(K.shape)} (3x3 wanted), T_world_camera 4x4 if given; save them again")
     try:

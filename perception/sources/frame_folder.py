@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.camera import Camera
-from foundation.bounded import check_size, parse_json
+from foundation.bounded import check_size, parse_json, read_text
 from foundation.whole_file import write_whole
 from perception.sources.frame import LAST_STAMP, SATURATED, Frame, known_counts
 from perception.sources.image_files import read_npy, read_picture, read_png
@@ -131,7 +131,7 @@ def write_frame_folder(path: Path | str, frame: Frame) -> None:
 def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
     """meta.json, its keys checked, and what it may omit filled in; depth_unit_m where there is `depth`."""
     try:
-        meta = parse_json(path.read_text(encoding="utf-8"))
+        meta = parse_json(read_text(path))
         check_size(meta)
     except (FileNotFoundError, NotADirectoryError):
         raise FileNotFoundError(f"{path} is missing; it gives camera_matrix_px and depth_unit_m") from None
@@ -142,7 +142,7 @@ def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
             raise ValueError(f"{path} has no {key}; add it (3x3 in px, and metres per count of depth.png)")
     unit = meta.get("depth_unit_m")
     number = isinstance(unit, int | float) and not isinstance(unit, bool)
-    if "depth_unit_m" in meta and not (number and 0 < unit <= 1):
+    if "depth_unit_m" in meta and not (number and 1e-6 <= unit <= 1):
         raise ValueError(f"{path}: depth_unit_m is {unit!r}; give metres per count, such as 0.001")
     optional = {"distortion": [0.0] * 5, "distortion_model": "plumb_bob", "stamp_ns": 0, "frame_id": "camera"}
     meta = {
@@ -153,6 +153,8 @@ def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
     for key, default in optional.items():
         if isinstance(meta[key], bool) or not isinstance(meta[key], type(default)):
             raise ValueError(f"{path}: {key} is {meta[key]!r}; give something like {default!r}, or omit it")
+    if not meta["frame_id"].isprintable():
+        raise ValueError(f"{path}: frame_id is {meta['frame_id'][:60]!a}; give letters that can be printed")
     if not 0 <= meta["stamp_ns"] < LAST_STAMP:
         raise ValueError(f"{path}: stamp_ns is {meta['stamp_ns']}; give nanoseconds from 0 to {LAST_STAMP}, or omit it")
     meta["camera_matrix_px"] = _numbers(path, "camera_matrix_px", meta["camera_matrix_px"], (3, 3))

@@ -2,7 +2,7 @@
 
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -10,10 +10,12 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 
 from foundation.bounded import check_arrays
+from foundation.one_line import one_line
 from probnerf.environment import MOST_PIXELS
 
 _PNG_MAGIC, _JPEG_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 LARGEST = MOST_PIXELS  # and values of an array
+_LARGEST_FILE = 1 << 29  # bytes
 
 
 def read_png(path: Path) -> Shaped[np.ndarray, "h w *c"]:
@@ -60,9 +62,10 @@ def read_npy(path: Path) -> Shaped[np.ndarray, "..."]:
     if not path.is_file():
         raise FileNotFoundError(f"{path} is missing")
     try:
-        values = np.load(path, allow_pickle=False, mmap_mode="r")
-    except (ValueError, OSError, EOFError, SyntaxError) as error:
-        raise ValueError(f"{path} is not a whole .npy file ({' '.join(str(error).split())}); save it again") from None
+        with np.errstate(over="ignore"):
+            values = np.load(path, allow_pickle=False, mmap_mode="r")
+    except Exception as error:  # NumPy parses the header as Python, which has many ways to fail
+        raise ValueError(f"{path} is not a whole .npy file ({one_line(error)[:200]}); save it again") from None
     return _plain(str(path), values)
 
 
@@ -76,11 +79,18 @@ def read_npz(path: Path, names: Sequence[str]) -> dict[str, Shaped[np.ndarray, "
             raise ValueError(f"{path}: {error}; give one frame") from None
         with np.load(path, allow_pickle=False) as arrays:
             chosen = [name for name in arrays.files if name.lower() in wanted]
-            return {name.lower(): _plain(f"{path}: {name}", arrays[name]) for name in chosen}
+            return {name.lower(): _plain(f"{path}: {name}", _loaded(path, arrays, name)) for name in chosen}
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, SyntaxError) as error:
         if isinstance(error, FileNotFoundError):
             raise FileNotFoundError(f"{path} is missing") from None
         raise ValueError(f"{path} is not a whole .npz file ({' '.join(str(error).split())}); save it again") from None
+
+
+def _loaded(path: Path, arrays: Mapping[str, np.ndarray], name: str) -> Shaped[np.ndarray, "..."]:
+    try:
+        return arrays[name]
+    except ValueError as error:
+        raise ValueError(f"{path}: {name} cannot be read ({one_line(error)[:200]}); save numbers") from None
 
 
 def _plain(name: str, values: Shaped[np.ndarray, "..."]) -> Shaped[np.ndarray, "..."]:
@@ -93,9 +103,13 @@ def _plain(name: str, values: Shaped[np.ndarray, "..."]) -> Shaped[np.ndarray, "
 
 def _bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(_LARGEST_FILE + 1)
     except (FileNotFoundError, NotADirectoryError):
         raise FileNotFoundError(f"{path} is missing; a frame folder holds color.png, depth.png and meta.json") from None
+    if len(data) > _LARGEST_FILE:
+        raise ValueError(f"{path} has more than {_LARGEST_FILE >> 20} MB; give one picture")
+    return data
 
 
 def _decoded(path: Path, data: bytes, kind: str) -> Shaped[np.ndarray, "h w *c"]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foundation.bounded import MOST_VALUES, check_arrays, check_size, parse_json
+from foundation.bounded import LARGEST_YAML, MOST_VALUES, check_arrays, check_size, parse_json, parse_yaml, read_text
 
 
 def npz(path: Path, shape: tuple[int, ...], held: int, dtype: str = "|u1") -> Path:
@@ -54,3 +54,33 @@ def test_aliases_count_as_often_as_they_are_used() -> None:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 50e6
+
+
+MERGED = "".join(f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}\n" for i in range(1, 12))
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (f"a0: &a0 {{k: v}}\n{MERGED}", "merged"),
+        ("[" * 90_000, "too deep"),
+        ("a: 1\n" * LARGEST_YAML, "kB"),
+        ("!!timestamp x", "groupdict"),
+    ],
+)
+def test_yaml_that_cannot_be_read_soon_is_refused(text: str, why: str) -> None:
+    with pytest.raises(ValueError, match=why) as caught:
+        parse_yaml(text)
+    assert "\n" not in str(caught.value)
+
+
+def test_merged_keys_are_read() -> None:
+    assert parse_yaml("a: &a {x: 1}\nb: {<<: *a, y: 2}")["b"] == {"x": 1, "y": 2}
+
+
+def test_no_more_is_read_than_may_be(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"\xef\xbb\xbfabc")
+    assert read_text(tmp_path / "a") == "abc"
+    for endless in (tmp_path / "a", Path("/dev/zero")):
+        with pytest.raises(ValueError, match="more than 0 kB"):
+            read_text(endless, 2)
