@@ -105,9 +105,9 @@ IMPORTERS: dict[str, tuple[str, ...]] = {
     "depthai": ("perception/sources/oak.py",),
     # recorded logs; messages on the bus
     "rosbags": (
+        "perception/sources/bounded_reading.py",
         "perception/sources/log_messages.py",
         "perception/sources/recorder.py",
-        "node/ros/bounded_reading.py",
         "node/ros/messages.py",
     ),
     "fsspec": ("foundation/store.py",),

@@ -19,11 +19,11 @@ from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
 from foundation.one_line import one_line
-from node.ros.bounded_reading import CountingStore
 from node.ros.foreign_types import MESSAGES, SERVICES
 from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
 from perception.observation.object_frame import ObjectFrame
+from perception.sources.bounded_reading import MOST_PARTS, CountingStore
 from perception.sources.frame import Frame
 from probnerf.types import StopReason
 
@@ -34,7 +34,6 @@ FOLDER = next((folder for folder in _PLACES if folder.is_dir()), _PLACES[0])
 HYPOTHESES = "farside_msgs/msg/ShapeHypotheses"
 QUERY_REGION = "farside_msgs/srv/QueryRegion"
 NEXT_VIEW = "farside_msgs/srv/NextView"
-MOST_PARTS = 100_000  # of a message: the messages within it, and within these
 EVENT = """service_msgs/ServiceEventInfo info
 {name}_Request[<=1] request
 {name}_Response[<=1] response
@@ -155,7 +154,7 @@ def encode(message: Any) -> bytearray:
 def decode(data: bytes, kind: str, most_parts: int = MOST_PARTS) -> Any:
     """The message in CDR bytes. Raises ValueError if they are no message of this type, or one of too many parts."""
     try:
-        message: Any = CountingStore(types(), most_parts).deserialize_cdr(data, kind)
+        message: Any = CountingStore(types(), most_parts, "parts (max_parts)").deserialize_cdr(data, kind)
     except (SerdeError, IndexError, OverflowError, MemoryError, AssertionError) as error:
         raise ValueError(f"{len(data)} bytes are no {kind}: {one_line(error)}") from None
     # rosbags takes a text that is cut short for a shorter text; written again, it would be longer than what came.

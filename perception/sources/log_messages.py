@@ -16,6 +16,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from foundation.one_line import one_line
+from perception.sources.bounded_reading import CountingStore
 from perception.sources.ros_camera import to_camera
 from perception.sources.ros_images import samples, stamp_ns
 
@@ -89,7 +90,8 @@ def open_log(path: Path) -> tuple[Read, dict[str, str], list[str]]:
                 for connection, time, raw in reader.messages(wanted) if wanted else ():
                     kind = connection.msgtype
                     with lost.counted(connection.topic, kind):
-                        message: Any = reader.deserialize(raw, kind)
+                        store = CountingStore(reader.typestore)
+                        message: Any = (store.deserialize_cdr if reader.is2 else store.deserialize_ros1)(raw, kind)
                         if lacks := _fields(kind) - {name.lower() for name in message.__dataclass_fields__}:
                             raise ValueError(f"its definition of {kind} lacks {', '.join(sorted(lacks))}")
                     if not lost.this_one:
@@ -207,7 +209,7 @@ def _open_cut(whole: Path, paths: list[Path], notes: list[str]) -> tuple[Read, d
             for topic, kind, raw in records(path):
                 if topic in topics:
                     with lost.counted(topic, kind):
-                        message = _TYPES.deserialize_cdr(raw.data, kind)
+                        message = CountingStore(_TYPES).deserialize_cdr(raw.data, kind)
                     if not lost.this_one:
                         yield Received(topic, kind, raw.log_time, message)
 

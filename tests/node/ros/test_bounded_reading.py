@@ -11,9 +11,10 @@ from rosbags.interfaces import Nodetype
 
 from node.ros.bus import Bus
 from node.ros.detections import DETECTIONS_IN
-from node.ros.messages import MOST_PARTS, decode, encode, make, type_hash, types
+from node.ros.messages import decode, encode, make, type_hash, types
 from node.ros.rmw_zenoh import attachment, key
 from node.ros.settings import BusConfig
+from perception.sources.bounded_reading import MOST_PARTS
 from tests.node.ros.test_detections import detection, detections
 
 PARTS_OF_ONE = 6  # a detection without results: itself, header, stamp, box, its centre and the centre's place

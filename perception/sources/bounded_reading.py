@@ -1,23 +1,27 @@
-"""CDR bytes read with a bound on the parts of a message: the messages within it, which are built one by one in Python.
+"""Messages read with a bound on their parts: the messages within them, which are built one by one in Python.
 
 A million of them, however short, take a minute and gigabytes. Arrays of numbers are not built so, and bounded by the
-bytes that came.
+bytes that came. A recording brings its own definitions, by which any message may have parts.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import lru_cache
 from typing import Any
 
 from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
+MOST_PARTS = 100_000
+
 
 class CountingStore(Typestore):
-    """The types of another store, for one call of `deserialize_cdr`: SerdeError beyond `most` parts."""
+    """The types of another store, to deserialise one message: SerdeError beyond `most` parts. `named` stands behind
+    the number in the error's line.
+    """
 
-    def __init__(self, types: Typestore, most: int) -> None:
-        self._types, self._most, self._count = types, most, 0
+    def __init__(self, types: Typestore, most: int = MOST_PARTS, named: str = "parts") -> None:
+        self._types, self._most, self._named, self._count = types, most, named, 0
         self.max_sequence_length = types.max_sequence_length
 
     def get_msgdef(self, typename: str) -> Any:
@@ -28,10 +32,10 @@ class CountingStore(Typestore):
         """One part more."""
         self._count += 1
         if self._count > self._most:
-            raise SerdeError(f"it has more than {self._most} parts (max_parts)")
+            raise SerdeError(f"it has more than {self._most} {self._named}")
 
 
-@cache
+@lru_cache(512)  # not for ever: each recording has a store of its own
 def _counted(types: Typestore, kind: str) -> Any:
     def counted(read: Callable) -> Callable:
         def one(data: memoryview, pos: int, cls: type, store: CountingStore) -> Any:
@@ -41,5 +45,5 @@ def _counted(types: Typestore, kind: str) -> Any:
         return one
 
     found = types.get_msgdef(kind)
-    le, be = counted(found.deserialize_cdr_le), counted(found.deserialize_cdr_be)
-    return replace(found, deserialize_cdr_le=le, deserialize_cdr_be=be)
+    names = ("deserialize_cdr_le", "deserialize_cdr_be", "deserialize_ros1")
+    return replace(found, **{name: counted(getattr(found, name)) for name in names})
