@@ -45,5 +45,9 @@ def _counted(types: Typestore, kind: str) -> Any:
         return one
 
     found = types.get_msgdef(kind)
-    names = ("deserialize_cdr_le", "deserialize_cdr_be", "deserialize_ros1")
-    return replace(found, **{name: counted(getattr(found, name)) for name in names})
+    return replace(
+        found,
+        deserialize_cdr_le=counted(found.deserialize_cdr_le),
+        deserialize_cdr_be=counted(found.deserialize_cdr_be),
+        deserialize_ros1=counted(found.deserialize_ros1),
+    )

@@ -17,7 +17,7 @@ from perception.sources.recording import Log
 from tests.perception.sources.test_recording import START, maker
 
 INFO = "sensor_msgs/msg/CameraInfo"
-CROWD = ("crowd", (Nodetype.SEQUENCE, ((Nodetype.NAME, "builtin_interfaces/msg/Duration"), 0)))
+CROWD: Any = ("crowd", (Nodetype.SEQUENCE, ((Nodetype.NAME, "builtin_interfaces/msg/Duration"), 0)))
 
 
 def crowded(kind: str) -> Typestore:
