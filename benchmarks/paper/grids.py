@@ -95,7 +95,8 @@ def answer_rows(view: Conditioned, model: ProbNeRF, effort: Effort, method: Meth
     T = np.concatenate([view.T_object_camera, view.held_out.T_object_camera[AHEAD : AHEAD + 1]])
     shown = pictures(model, found.likelihood, positions, T)
     true = view.given.rgb[0] / 255.0, view.held_out.rgb[AHEAD] / 255.0
-    labels = f"{method.name}\ngiven", f"{method.name}\nhidden side"
+    name = method.name.replace(", ", ",\n")
+    labels = f"{name}\ngiven", f"{name}\nhidden side"
     return [(labels[v], [true[v], *shown[:, v], deviation(shown[:, v])]) for v in range(2)]
 
 
