@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float
 
 REACH = 1e6  # m; a region may lie so far from the frame's origin. Farther, sizes and volumes overflow
 MOST_CELLS = 20_000_000  # of the box about a mesh
+_MOST_PIECES = 2_000_000  # no larger than a cell, of a mesh's triangles
+_MESHES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf")  # trimesh unpacks archives, too
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ def read_points(path: str | Path) -> Points:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; give a text file with x y z (metres) on each line")
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise ValueError(f"{path} is not a text file; write x y z (metres) on each line") from None
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.partition("#")[0].strip()]
@@ -137,6 +139,8 @@ def read_mesh(path: Path, width: float) -> Cells:
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; give a mesh (.obj, .stl, .ply, .off or .glb, in metres)")
+    if path.suffix.lower() not in _MESHES:
+        raise ValueError(f"{path} is no mesh by its name; give a {', '.join(_MESHES)} file, in metres")
     try:
         mesh = trimesh.load_mesh(path, process=False)  # processing drops vertices that are not finite
     except Exception as error:  # the formats' readers raise various types
@@ -152,5 +156,16 @@ def read_mesh(path: Path, width: float) -> Cells:
         raise ValueError(
             f"{path} is {size} m large: too large to be filled with cells of {width:g} m; is it in metres?"
         )
-    filled = mesh.voxelized(width).fill("holes")
+    if int(mesh.faces.min()) < 0:
+        raise ValueError(f"{path} has a triangle of vertex {int(mesh.faces.min())}; export it again")
+    pieces = float((np.ceil(mesh.edges_unique_length[mesh.faces_unique_edges].max(axis=1) / width) ** 2).sum())
+    if pieces > _MOST_PIECES:
+        raise ValueError(
+            f"{path} has {len(mesh.faces)} triangles that meet too many cells of {width:g} m; simplify it, or keep what"
+            " is near the objects (is it in metres?)"
+        )
+    try:
+        filled = mesh.voxelized(width).fill("holes")
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be filled ({error}); export it again, with shorter triangles") from None
     return Cells(np.asarray(filled.points, np.float64), width)

@@ -23,6 +23,11 @@ def check_camera(camera: Camera) -> None:
             f"the camera's focal length is {f:.4g} px, which no picture {camera.width} px wide has; give its matrix in"
             " pixels, or calibrate"
         )
+    if camera.K_std is not None and not camera.K_std[0, 0] < f:
+        raise ValueError(
+            f"the camera's focal length is {f:.4g} px with a deviation of {camera.K_std[0, 0]:.4g}: it is not"
+            " determined; calibrate again"
+        )
     grid = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9))
     unseen = float(np.isnan(camera.rays(np.stack(grid, axis=-1).reshape(-1, 2))).any(axis=1).mean())
     if unseen > _UNSEEN:

@@ -14,6 +14,7 @@ SATURATED = 65535  # depth count of 16 bits
 LAST_STAMP = 2**31 * 10**9  # ns; ROS counts its seconds in 32 bits
 
 _FARTHEST_MEDIAN = 200.0  # m
+_FARTHEST = 1e7  # m, of a camera from the world's origin (UTM's northings end there)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -58,7 +59,9 @@ class Frame:
                 f"the stamp is {stamp_ns} ns; give nanoseconds since 1970, from 0 to {LAST_STAMP}: set the clock that"
                 " stamps the images"
             )
-        if T_world_camera is not None and not (np.shape(T_world_camera) == (4, 4) and rigid(T_world_camera)):
+        if T_world_camera is not None and not (
+            np.shape(T_world_camera) == (4, 4) and rigid(T_world_camera) and np.abs(T_world_camera).max() <= _FARTHEST
+        ):
             raise ValueError(f"T_world_camera {T_world_camera} is no rotation with a translation (m) beside it")
         if depth is not None:  # a sensor's zero or infinity is no distance
             depth = _plane("depth", depth, np.float32, rgb)

@@ -185,8 +185,8 @@ def _read(path: Path, what: str, remedy: str) -> tuple[dict[str, Any], dict[str,
     try:
         with safe_open(path, framework="np") as file:
             story = parse_json((file.metadata() or {}).get("farside", "{}"))
-            if not isinstance(story, dict):
-                raise ValueError("its metadata is no mapping")
+            if not isinstance(story, dict) or not all(isinstance(story.get(k, ""), str) for k in ("format", "preset")):
+                raise ValueError("its metadata is no mapping, or names no format")
             return story, {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, ValueError, OSError) as error:
         raise ValueError(f"{path} is not a readable {what} ({error}); {remedy}") from None
@@ -200,6 +200,9 @@ def _filled(model: M, arrays: dict[str, np.ndarray], path: Path, owner: str) -> 
         if found is None or found.shape != leaf.shape:
             shape = "missing" if found is None else f"of shape {list(found.shape)}"
             raise ValueError(f"{path}: array {name} is {shape}, {owner} needs {list(leaf.shape)}; train it again")
+        if found.dtype.kind != "f" or not np.isfinite(found).all():
+            what = f"of {found.dtype}" if found.dtype.kind != "f" else "not finite"
+            raise ValueError(f"{path}: array {name} is {what}; weights are finite floats: copy it, or train it, again")
     # a file in half precision is read in the model's own
     leaves = jax.device_put([arrays[name].astype(leaf.dtype, copy=False) for name, leaf in named.items()])
     return jax.tree.unflatten(jax.tree.structure(model), leaves)

@@ -80,7 +80,7 @@ def test_what_is_no_mesh_is_named(tmp_path: Path) -> None:
         "cut.glb": "cannot be read as a mesh",
         "points.obj": "holds no triangles",
         "nan.obj": r"vertex 1 is \[nan, 0.0, 0.0\]",
-        "words.txt": "cannot be read as a mesh",
+        "words.txt": "no mesh by its name",
     }.items():
         with pytest.raises(ValueError, match=complaint):
             read_mesh(tmp_path / name, 0.01)
@@ -118,3 +118,19 @@ def test_points_are_read_and_bad_lines_named(tmp_path):
         read_points(path)
     with pytest.raises(FileNotFoundError, match=r"absent\.xyz: no such file"):
         read_points(tmp_path / "absent.xyz")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "why"),
+    [
+        ("long.obj", "v 0 0 0\nv 40000 0 0\nv 0 0.001 0\nf 1 2 3\n", "too large|too many cells"),
+        ("many.obj", "v 0 0 0\nv .02 0 0\nv 0 .02 0\n" + "f 1 2 3\n" * 100_000, "100000 triangles"),
+        ("a.zip", "PK", "no mesh by its name"),
+        ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 -3\n", "vertex -3|cannot be read|no triangles"),
+    ],
+)
+def test_a_mesh_that_takes_too_long_or_is_none_is_named(tmp_path: Path, name: str, text: str, why: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=why) as caught:
+        read_mesh(tmp_path / name, 0.004)
+    assert name in str(caught.value)
