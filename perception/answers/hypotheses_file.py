@@ -93,6 +93,8 @@ def save(path: str | Path, hypotheses: Hypotheses) -> None:
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     np.lib.format.write_array(member, array, allow_pickle=False)
     except OSError as error:
+        if error.strerror is None:  # said already
+            raise
         raise OSError(
             f"{path} cannot be written ({error.strerror or error}); make room or give another place"
         ) from None

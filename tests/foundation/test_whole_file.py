@@ -1,5 +1,7 @@
 """A file is there whole, or what was there before is."""
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -63,3 +65,18 @@ def test_a_place_that_holds_no_folder_is_named(tmp_path: Path, name: str) -> Non
     with pytest.raises(ValueError, match=r"give a(nother)? folder") as caught:
         check_folder(folder)
     assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_full_disk_is_named_with_the_file_whatever_a_library_makes_of_it(tmp_path: Path) -> None:
+    for code in (errno.ENOSPC, errno.EFBIG):
+        with (
+            pytest.raises(OSError, match=r"a\.png cannot be written \(.*\); make room"),
+            whole_file(tmp_path / "a.png"),
+        ):
+            try:
+                raise OSError(code, os.strerror(code))
+            finally:
+                raise RuntimeError("a stream was not flushed")
+    with pytest.raises(RuntimeError), whole_file(tmp_path / "a.png"):
+        raise RuntimeError("of another cause")
+    assert not list(tmp_path.iterdir())
