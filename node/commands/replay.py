@@ -164,8 +164,8 @@ def report(h: Hypotheses, out: Console, seconds: float | None = None, log: Seque
     `seconds` is the time of inference, `log` the reasons for the amount of model.
     """
     label = f" ({h.label})" if h.label else ""
-    line = Text.assemble((f"object {h.object_id}{label}:", "bold"), f" {answer(summarise(h))}")
-    out.print(line, highlight=False, soft_wrap=True)
+    first = Text.assemble((f"object {h.object_id}{label}:", "bold"), f" {answer(summarise(h))}")
+    out.print(first, highlight=False, soft_wrap=True)
     table = Table.grid(padding=(0, 2))
     for name, value in figures(h).items():
         table.add_row(f"  {name}", value)

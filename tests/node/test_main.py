@@ -229,7 +229,7 @@ def test_a_bad_frame_folder_is_named(
         (["query", "{mug}", "--box", "0", "0", "0", "1", "-1", "1"], "the box is empty: y1 = -1 is not greater"),
         (["query", "{mug}", *BOX, "--risk", "0.6"], "risk is 0.6; give the chance of being wrong"),
         (["query", "{mug}", "--points", "p.xyz"], "p.xyz: no such file; give a text file"),
-        (["query", "{mug}", "--mesh", "{text}"], "notes.txt cannot be read as a mesh"),
+        (["query", "{mug}", "--mesh", "{text}"], "notes.txt is no mesh by its name"),
         (["query", "{mug}", *BOX, "--frame", "world"], "without the camera's pose in the world"),
         (["view", "{text}"], "notes.txt is not a hypotheses file"),
         (["view", "{mug}", "--port", "70000"], "port 70000 does not exist; give one of 0 to 65535"),

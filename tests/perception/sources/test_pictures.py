@@ -101,3 +101,13 @@ def test_what_holds_no_picture_says_so(tmp_path: Path) -> None:
     says(tmp_path / "cut.png", "cut short at byte")
     (tmp_path / "bad.jpg").write_bytes(b"\xff\xd8 no picture")
     says(tmp_path / "bad.jpg", "cannot be decoded")
+
+
+def test_a_cut_picture_of_a_recording_costs_itself(tmp_path: Path) -> None:
+    make = maker("mcap")
+    data = cv2.imencode(".jpg", RGB[0])[1].ravel()
+    sent = [make.compressed("/cam/image/compressed", 10 + i, data[: 300 if i == 1 else None], "jpeg") for i in range(3)]
+    notes: list[str] = []
+    pictures, _ = open_pictures(record(tmp_path / "a", "mcap", sent), notes)
+    assert [picture.name for picture in pictures] == ["frame 0", "frame 2"]
+    assert "pictures that cannot be read left out: 1" in notes[-1]

@@ -108,3 +108,18 @@ def test_a_roi_and_binning_of_zeros_is_the_whole_sensor() -> None:
 
 def test_an_uncalibrated_camera_is_known() -> None:
     assert is_empty(info("", [], k=np.zeros(9))) and not is_empty(info("", []))
+
+
+def test_zeros_at_the_end_may_be_left_out_or_added() -> None:
+    for model, d in (
+        ("plumb_bob", [0.1, -0.2]),
+        ("plumb_bob", [*BROWN, 0.0]),
+        ("rational_polynomial", [*BROWN, 0.1, 0, 0, 0, 0]),
+    ):
+        whole = to_camera(info("rational_polynomial", (d + [0.0] * 8)[:8]), rectified=False)
+        found = to_camera(info(model, d), rectified=False)
+        np.testing.assert_allclose(
+            found.project(np.array([[0.2, 0.1, 1.0]])), whole.project(np.array([[0.2, 0.1, 1.0]]))
+        )
+    with pytest.raises(ValueError, match="does not fit plumb_bob"):
+        to_camera(info("plumb_bob", [*BROWN, 0.1]), rectified=False)
