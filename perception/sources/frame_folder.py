@@ -153,8 +153,8 @@ def _read_meta(path: Path, depth: bool) -> dict[str, Any]:
     for key, default in optional.items():
         if isinstance(meta[key], bool) or not isinstance(meta[key], type(default)):
             raise ValueError(f"{path}: {key} is {meta[key]!r}; give something like {default!r}, or omit it")
-    if not meta["frame_id"].isprintable():
-        raise ValueError(f"{path}: frame_id is {meta['frame_id'][:60]!a}; give letters that can be printed")
+    if any("\ud800" <= letter <= "\udfff" for letter in meta["frame_id"]):  # JSON may hold halves of letters
+        raise ValueError(f"{path}: frame_id is {meta['frame_id'][:60]!a}; give whole letters")
     if not 0 <= meta["stamp_ns"] < LAST_STAMP:
         raise ValueError(f"{path}: stamp_ns is {meta['stamp_ns']}; give nanoseconds from 0 to {LAST_STAMP}, or omit it")
     meta["camera_matrix_px"] = _numbers(path, "camera_matrix_px", meta["camera_matrix_px"], (3, 3))

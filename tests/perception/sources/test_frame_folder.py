@@ -270,3 +270,9 @@ def test_what_is_recorded_is_not_live(folder: Path) -> None:
     for source in (open_source(folder), open_source(None)):
         assert not source.live
         source.close()  # and may be closed nevertheless
+
+
+def test_a_name_of_half_letters_is_refused(folder: Path) -> None:
+    meta = json.loads((folder / "meta.json").read_text())
+    (folder / "meta.json").write_text(json.dumps(meta | {"frame_id": "\udcff"}))
+    fails(folder, "meta.json", "frame_id is '\\udcff'")
