@@ -193,4 +193,7 @@ def test_an_answer_is_the_same_in_every_frame(h: Hypotheses, seed: int) -> None:
     for frame in ("camera", "world"):
         T = np.linalg.inv(h.T_object_from(frame))
         there = query([h], Points(points @ T[:3, :3].T + T[:3, 3]), frame, NOW)
-        assert there.as_dict() == own.as_dict()
+        a, b = there.as_dict(), own.as_dict()
+        for name in ("p_occupied", "p_occupied_few"):  # between voxels' centres
+            assert a.pop(name) == pytest.approx(b.pop(name), abs=1e-6)
+        assert a == b

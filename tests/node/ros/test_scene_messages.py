@@ -47,7 +47,7 @@ def test_the_cloud_says_what_a_query_says() -> None:
     assert message.header.frame_id == scene[0].frame_id and message.header.stamp.nanosec == STAMP_NS % 10**9
     xyz = np.stack([points["x"], points["y"], points["z"]], axis=1).astype(np.float64)
     asked = query(scene[:1], Points(xyz), "camera", now_ns=STAMP_NS)
-    np.testing.assert_allclose(points["p_occupied"], asked.p_occupied, atol=1e-6)
+    np.testing.assert_allclose(points["p_occupied"], asked.p_occupied, atol=1e-4)  # places are in single precision
     assert len(points) == (scene[0].p_occupied >= 0.05).sum()
     inside = (xyz - scene[0].object_frame.T_camera_object[:3, 3]) @ scene[0].object_frame.T_camera_object[:3, :3]
     left = np.all((inside > LEFT[0]) & (inside < LEFT[1]), axis=1)
