@@ -54,8 +54,8 @@ class Camera:
                 continue
             values = np.asarray(values, np.float64)
             if values.shape != of.shape or not (values >= 0).all():
-                shape = "x".join(map(str, of.shape)) or "one"
-                raise ValueError(f"{name} is {values.tolist()}; deviations are {shape} numbers, 0 or more")
+                wanted = f"{'x'.join(map(str, of.shape))} numbers" if of.shape else "one number"
+                raise ValueError(f"{name} is {values.tolist()}; {wanted} wanted, 0 or more")
         object.__setattr__(self, "model", model)
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "distortion", distortion)

@@ -102,7 +102,9 @@ def _structured(path: Path, text: str) -> list[tuple[str | None, Any]]:
         content = parse_json(text) if path.suffix.lower() == ".json" else parse_yaml(text)
         check_size(content)
     except ValueError as error:
-        raise ValueError(f"{path} cannot be read ({one_line(error)[:200]}); give {_FORMS}") from None
+        raise ValueError(
+            f"{path} cannot be read ({one_line(error)[:200]}); give, in text, JSON or YAML, {_FORMS}"
+        ) from None
     if isinstance(content, Mapping) and len(content) == 1 and isinstance(inner := next(iter(content.values())), list):
         content = inner  # poses: [...]
     if isinstance(content, Mapping):

@@ -32,6 +32,7 @@ from node.ros.octree import LEVELS
 from node.ros.planner_messages import ESDF, collision_object, octomap_message
 from node.ros.services import Answers
 from node.ros.settings import BusConfig, PlannerConfig
+from perception.answers.query import marginal
 from probnerf.types import BASE_Z
 
 AROUND = 0.4  # m; the ball stays so near to the object's middle
@@ -42,7 +43,7 @@ Clear = Callable[[Float[np.ndarray, "3"]], bool]  # whether the ball may be ther
 
 def rules(h: farside.Hypotheses, risk: float, radius: float) -> dict[str, Clear]:
     """When the ball is clear, by each rule and message."""
-    risky, seen, unseen = h.p_occupied.ravel() > risk, h.seen.ravel(), h.unseen.ravel()
+    risky, seen, unseen = marginal(h) > risk, h.seen.ravel(), h.unseen.ravel()
     of_seen, planner = in_voxels(h, risky & seen, radius), PlannerConfig(risk=risk)
     answers = Answers(planner=planner)
     answers.update([h])
@@ -65,7 +66,7 @@ def read_back(message: Any) -> Any:
 
 
 def in_voxels(h: farside.Hypotheses, blocked: Bool[np.ndarray, "V"], radius: float) -> Clear:
-    steps = np.arange(-radius, radius + h.voxel_m, h.voxel_m)
+    steps = h.voxel_m * np.arange(-np.ceil(radius / h.voxel_m), np.ceil(radius / h.voxel_m) + 1)
     ball = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     ball = ball[np.linalg.norm(ball, axis=1) <= radius]
 

@@ -5,7 +5,8 @@
     python examples/06_dds_relay.py --connect tcp/127.0.0.1:7448 --domain-id 0
 
 The camera's topics and /tf go to the bus; the planning scene and what else is named in `--to-dds` goes to DDS. Messages
-are CDR on both sides: they are checked and passed on as they are. Services are not carried: DDS has no common form of
+are CDR on both sides: they are checked and passed on as they are. Who joins late on DDS gets the last ten messages of
+hypotheses, of all objects together. Services are not carried: DDS has no common form of
 them. Ask with `farside query`, or in Python. CYCLONEDDS_URI configures DDS as for ROS 2.
 """
 

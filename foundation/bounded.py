@@ -37,13 +37,26 @@ def check_nesting(text: str) -> None:
             raise ValueError("it is nested too deep")
 
 
-class _Loader(yaml.SafeLoader):
-    """Merge keys (<<) are copied when they are read: repeated, they multiply."""
+class Merging:
+    """Counts the keys that mappings of one text merge (<<), before they are copied: repeated, they multiply.
 
-    def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        super().flatten_mapping(node)
-        if len(node.value) > MOST_VALUES:
+    Mixed into PyYAML's and ruamel's constructors. ValueError beyond `MOST_VALUES`.
+    """
+
+    _merged = 0
+
+    def flatten_mapping(self, node: Any) -> None:
+        """Copies the merged keys of a mapping's node into it, as the constructor does."""
+        for key, of in node.value:
+            if key.value == "<<":
+                self._merged += sum(len(one.value) for one in (of.value if of.id == "sequence" else [of]))
+        if self._merged > MOST_VALUES:
             raise ValueError(f"it holds more than {MOST_VALUES} values, merged keys counted")
+        super().flatten_mapping(node)  # type: ignore[misc]
+
+
+class _Loader(Merging, yaml.SafeLoader):
+    pass
 
 
 def parse_yaml(text: str) -> Any:
@@ -53,12 +66,14 @@ def parse_yaml(text: str) -> Any:
     """
     try:
         if len(text) > LARGEST_YAML:
-            raise ValueError(f"it has more than {LARGEST_YAML >> 10} kB")
+            raise ValueError(f"it has more than {LARGEST_YAML >> 10} kB, the most of YAML")
         check_nesting(text)
         content = yaml.load(text, _Loader)
         check_size(content)
-    except Exception as error:  # tags that do not fit (`!!bool x`) fail in many ways
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(one_line(error)) from None
+    except Exception:  # `!!bool x` fails in many ways
+        raise ValueError("a value does not fit its tag (!!)") from None
     return content
 
 

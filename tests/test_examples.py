@@ -86,8 +86,8 @@ def test_ompl_plans_against_each_thing_that_planners_get(
         publisher = bus.publisher("~/hypotheses", HYPOTHESES, latched=True, depth=8)
         publisher.publish(hypotheses_message(h))
         where = {"file": farside.save(tmp_path, h)[0]} if source == "file" else {"connect": endpoint}
-        beside = main((0.0, -0.3, 0.0), (0.0, 0.1, 0.0), seconds=0.5, **where)
-        handle = main((0.0, 0.3, 0.0), (0.07, 0.03, 0.0), seconds=0.5, **where)
+        beside = main((0.0, -0.3, 0.0), (0.0, 0.1, 0.0), seconds=2.0, **where)
+        handle = main((0.0, 0.3, 0.0), (0.07, 0.03, 0.0), seconds=2.0, **where)
         inside = main((0.0, 0.3, 0.0), (0.0, 0.025, 0.0), seconds=0.5, **where)
     assert set(beside) == careful | {"unknown is free", "unknown is occupied", "octomap"}
     found = [{rule: answer and answer.p_free for rule, answer in way.items()} for way in (beside, handle, inside)]

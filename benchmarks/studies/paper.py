@@ -45,8 +45,9 @@ decoders: pixels a second of this decoder, and of decoders that are told the lat
 pictures: `python -m benchmarks.paper.grids` draws those at the end, uncurated, of the first test seeds. An ambulance
 from behind, annealed and at one temperature, and answers to a car from behind: the truth, 8 draws (of the ambulance,
 the chains' last states), and the deviation of each pixel between them (black 0, white 0.25), of the given view and of
-the hidden side. Samples: the prior's above, true cars below. Looked at: hidden sides differ more than given ones; at
-one temperature most of the ambulance's chains end at other vehicles, with the tuned step, too (it has no rows yet).
+the hidden side. Samples: the prior's above, true cars below. Looked at: hidden sides of hmc's answers differ more than
+given ones; at one temperature most of the ambulance's chains end at other vehicles, with the tuned step, too (it has
+no rows yet).
 
 The first table has the paper's claims with a verdict each, computed from these rows (`benchmarks.paper.claims`).
 

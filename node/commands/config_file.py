@@ -16,7 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.constructor import DuplicateKeyError, SafeConstructor
 
-from foundation.bounded import LARGEST_YAML, MOST_VALUES, check_nesting, check_size, read_text
+from foundation.bounded import LARGEST_YAML, Merging, check_nesting, check_size, read_text
 from foundation.one_line import one_line
 
 T = TypeVar("T")
@@ -32,13 +32,8 @@ _REMEDIES = {
 }
 
 
-class _Constructor(SafeConstructor):
-    """Merge keys (<<) are copied when they are read: repeated, they multiply."""
-
-    def flatten_mapping(self, node: Any) -> None:
-        super().flatten_mapping(node)
-        if len(node.value) > MOST_VALUES:
-            raise ValueError(f"it holds more than {MOST_VALUES} values, merged keys counted")
+class _Constructor(Merging, SafeConstructor):
+    pass
 
 
 def load_config(path: Path, into: type[T]) -> T:

@@ -51,7 +51,8 @@ class QueryResult:
     # by object id: which of its hypotheses (rows of its file) have something in the region, where some have: those
     # disagree with the rest
     blocked_by: dict[int, list[int]] = field(default_factory=dict)
-    p_occupied: list[float] | None = None  # of each point, between voxels' centres; None for a box
+    # of each point, between voxels' centres, and so not 1 - p_free of the voxel that holds it; None for a box
+    p_occupied: list[float] | None = None
     p_occupied_few: list[float] | None = None  # the same by the rule of succession, in unseen space
 
     def verdict(self, risk: float = 0.05) -> Verdict:
@@ -295,14 +296,14 @@ def _at_points(h: Hypotheses, points: Float[np.ndarray, "n 3"], frame: FrameName
     """One object's p at points; 0 outside its cube.
 
     Seen space is told voxel by voxel. In unseen space p is linear between the centres of voxels, for a shape's wall is
-    known no better than to a voxel, and in the lowest half voxel it falls towards the table, which is not the object's.
+    known no better than to a voxel; so where a shape ends at the table, it falls within the half voxel above.
     """
     index = h.voxels(frame, *points.T)
     inside = index >= 0
     unseen = inside & h.unseen.ravel()[index]
     p = np.where(inside, h.p_occupied.ravel()[index], 0.0)
     places = (h.to_cube(frame, *points[unseen].T) + 1.0) * (0.5 * h.grid) - 0.5
-    p[unseen] = map_coordinates(h.p_occupied, places.T, order=1, mode="nearest")
+    p[unseen] = np.clip(map_coordinates(h.p_occupied, places.T, order=1, mode="nearest"), 0.0, 1.0)
     if h.out_of_model:
         p = (1 - CAUTION) * p + CAUTION * unseen
     return np.where(unseen, _succession(p, h), p) if few else p

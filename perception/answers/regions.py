@@ -158,11 +158,12 @@ def read_mesh(path: Path, width: float) -> Cells:
         )
     if int(mesh.faces.min()) < 0:
         raise ValueError(f"{path} has a triangle of vertex {int(mesh.faces.min())}; export it again")
-    pieces = float((np.ceil(mesh.edges_unique_length[mesh.faces_unique_edges].max(axis=1) / width) ** 2).sum())
+    longest = mesh.edges_unique_length[mesh.faces_unique_edges].max(axis=1)
+    pieces = float((4.0 ** np.ceil(np.log2(np.maximum(longest / width, 1.0)))).sum())  # trimesh halves the edges
     if pieces > _MOST_PIECES:
         raise ValueError(
-            f"{path} has {len(mesh.faces)} triangles that meet too many cells of {width:g} m; simplify it, or keep what"
-            " is near the objects (is it in metres?)"
+            f"{path} has {len(mesh.faces)} triangles that meet too many cells of {width:g} m; keep what is near the"
+            " objects, or simplify it (is it in metres?)"
         )
     try:
         filled = mesh.voxelized(width).fill("holes")

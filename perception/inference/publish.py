@@ -1,6 +1,5 @@
 """From a posterior's samples to Hypotheses."""
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -210,9 +209,7 @@ def _with_surface(h: Hypotheses, surface: Bool[np.ndarray, "G G G"]) -> Hypothes
         near = np.zeros(len(at), bool)
         for offset in np.argwhere(ndimage.generate_binary_structure(3, 1)):
             near |= walls[tuple((at + offset).T)]
-        # Just a wall: a surface that is interpolated (`mesh`) then passes the voxel's middle, not its far side. Inside
-        # of a solid it is made so, too, where it is solid already.
-        shape[tuple(at[~near].T)] = math.ceil(255.0 * WALL_OPACITY)
+        shape[tuple(at[~near].T)] = 255  # inside of a solid, too, where it is solid already
     return replace(h, opacity=opacity)
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from calibration.camera import Camera
 
 _FOCAL = (0.1, 100.0)  # of the picture's width, as lenses have it
-_UNSEEN = 0.5  # of the picture; of some calibrations the corners are
+_UNSEEN = 0.5  # of the picture's middle; fisheyes see a circle, and of some calibrations the corners have no ray
 
 
 def check_camera(camera: Camera) -> None:
@@ -28,10 +28,10 @@ def check_camera(camera: Camera) -> None:
             f"the camera's focal length is {f:.4g} px with a deviation of {camera.K_std[0, 0]:.4g}: it is not"
             " determined; calibrate again"
         )
-    grid = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9))
+    grid = np.meshgrid(*(size * np.linspace(0.375, 0.625, 9) for size in (camera.width, camera.height)))
     unseen = float(np.isnan(camera.rays(np.stack(grid, axis=-1).reshape(-1, 2))).any(axis=1).mean())
     if unseen > _UNSEEN:
         raise ValueError(
             f"the camera's lens ({camera.model} {camera.distortion.tolist()}) has no ray for {100 * unseen:.0f}% of the"
-            " picture; calibrate it again, or give a camera file (--camera)"
+            " picture's middle; calibrate it again, or give a camera file (--camera)"
         )

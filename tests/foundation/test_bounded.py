@@ -65,7 +65,13 @@ MERGED = "".join(f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}\n" for 
         (f"a0: &a0 {{k: v}}\n{MERGED}", "merged"),
         ("[" * 90_000, "too deep"),
         ("a: 1\n" * LARGEST_YAML, "kB"),
-        ("!!timestamp x", "groupdict"),
+        (f"a: &a {{{', '.join(f'k{i}: 0' for i in range(3000))}}}\nb: {{<<: [{', '.join(['*a'] * 6000)}]}}", "merged"),
+        (
+            f"a: &a {{{', '.join(f'k{i}: 0' for i in range(3000))}}}\n"
+            + "\n".join(f"b{i}: {{<<: [{', '.join(['*a'] * 30)}]}}" for i in range(500)),
+            "merged",
+        ),
+        ("!!timestamp x", "does not fit its tag"),
     ],
 )
 def test_yaml_that_cannot_be_read_soon_is_refused(text: str, why: str) -> None:
