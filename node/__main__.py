@@ -34,7 +34,7 @@ from probnerf.environment import prepare
 
 Config = TypeVar("Config", ReplayConfig, Segmenting, LiveConfig, BatchConfig)
 
-_LONGEST = 900  # characters of an error
+_LONGEST = 800  # characters of an error
 DESCRIPTION = """Farside: from one partial RGB-D view of an object, several whole, weighted shapes, and the probability
 that any space the camera cannot see is occupied. Lengths are in metres. --version prints the version; with --debug an
 error shows its traceback."""

@@ -1,7 +1,8 @@
 """Messages read with a bound on their parts: the messages within them, which are built one by one in Python.
 
 A million of them, however short, take a minute and gigabytes. Arrays of numbers are not built so, and bounded by the
-bytes that came; arrays of texts are built one by one, too, and bounded by the bytes alone (8 MB of them take 3 s). A recording brings its own definitions, by which any message may have parts.
+bytes that came; arrays of texts are built one by one, too, and bounded by the bytes alone (8 MB of them take 3 s). A
+recording brings its own definitions, by which any message may have parts.
 """
 
 from collections.abc import Callable

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.next_view import NextViewConfig, rank_views
-from perception.answers.query import QueryResult, query
+from perception.answers.query import QueryResult, marginal, query
 from perception.answers.regions import Box, Points, Region, Swept
 from tests.properties.drawn import hypotheses, law, poses, scenes, seeds, slower_law
 
@@ -105,8 +105,13 @@ def test_answers_are_probabilities_shares_and_ordered_volumes(scene: list[Hypoth
         assert 0.0 <= r.volume_m3["q05"] <= r.volume_m3["q50"] <= r.volume_m3["q95"]
         assert 0.0 <= r.unseen_fraction and r.unseen_fraction + r.outside_fraction <= 1.0 + ROUNDING
         assert 0.0 <= r.entropy_nats <= np.log(2.0) + ROUNDING
-        if r.p_occupied is not None:  # all of it is free no more often than its most doubtful point
-            assert p_free <= 1.0 - max(r.p_occupied) + ROUNDING
+        if isinstance(region, Points):  # all of it is free no more often than its most doubtful point's voxel
+            free = np.ones(len(region.points))
+            for h in scene:
+                index = h.voxels("camera", *region.points.T)
+                free *= np.where(index >= 0, 1.0 - marginal(h)[index], 1.0)
+            assert p_free <= free.min() + ROUNDING
+            assert r.p_occupied is not None and 0.0 <= min(r.p_occupied) and max(r.p_occupied) <= 1.0
 
 
 @law
