@@ -82,6 +82,7 @@ def test_a_job_leaves_shapes_pictures_and_objects_and_is_not_repeated(tmp_path: 
     assert isinstance(nothing, str) and "FileNotFound" in nothing
 
 
+@pytest.mark.slow
 def test_objects_read_back(tmp_path: Path) -> None:
     for job in (Job("household", None, 4, 1), Job("tabletop", None, 0, 8)):
         made = make(job, tmp_path)

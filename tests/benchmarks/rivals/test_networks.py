@@ -79,6 +79,7 @@ def test_a_discriminator_does_not_see_detail_before_it_fades_in(pictures):
     assert not np.allclose(judge(rgb, T[::-1], jnp.asarray(1.0)), after[0], atol=1e-3)  # it is told the camera
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pixel_nerf", "nerf_vae", "pi_gan"])
 def test_everything_learns_and_a_file_gives_it_back(name, pictures, tmp_path: Path):
     config = tiny(name)

@@ -46,6 +46,7 @@ def functa(balls):
     return pictures, config, entry
 
 
+@pytest.mark.slow
 def test_the_field_learns_to_fit_objects_in_three_steps(balls):
     pictures, config, entry = functa(balls)
     recipe = entry.recipe(config)
