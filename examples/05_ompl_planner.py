@@ -32,7 +32,6 @@ from node.ros.octree import LEVELS
 from node.ros.planner_messages import ESDF, collision_object, octomap_message
 from node.ros.services import Answers
 from node.ros.settings import BusConfig, PlannerConfig
-from perception.answers.query import marginal
 from probnerf.types import BASE_Z
 
 AROUND = 0.4  # m; the ball stays so near to the object's middle
@@ -43,7 +42,10 @@ Clear = Callable[[Float[np.ndarray, "3"]], bool]  # whether the ball may be ther
 
 def rules(h: farside.Hypotheses, risk: float, radius: float) -> dict[str, Clear]:
     """When the ball is clear, by each rule and message."""
-    risky, seen, unseen = marginal(h) > risk, h.seen.ravel(), h.unseen.ravel()
+    axis = (np.arange(h.grid) + 0.5) * h.voxel_m - h.object_frame.half_extent
+    centres = farside.Points(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3))
+    p = farside.query(h, centres, "object").p_occupied  # cautious where the object is out of model
+    risky, seen, unseen = np.array(p) > risk, h.seen.ravel(), h.unseen.ravel()
     of_seen, planner = in_voxels(h, risky & seen, radius), PlannerConfig(risk=risk)
     answers = Answers(planner=planner)
     answers.update([h])
