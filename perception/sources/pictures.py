@@ -97,7 +97,7 @@ def _logged(path: Path, notes: list[str]) -> Iterator[Picture]:
         yield picture
     if broken and not good:
         raise ValueError(broken[0])
-    notes += [*others, *lacks]
+    notes += [*(note.partition(" (choose")[0] for note in others), *lacks]  # a calibration has no such option
     if broken:
         notes.append(f"pictures that cannot be read left out: {len(broken)}; the first: {broken[0]}")
 
