@@ -17,6 +17,7 @@ from scipy.ndimage import map_coordinates
 
 from perception.answers.hypotheses import FrameName, Hypotheses, binary_entropy
 from perception.answers.regions import Cells, Points, Region, Swept
+from probnerf.rendering.occupancy import voxel_index
 from probnerf.types import BASE_Z
 
 Verdict = Literal["free", "occupied", "unsure", "unseen"]
@@ -298,11 +299,12 @@ def _at_points(h: Hypotheses, points: Float[np.ndarray, "n 3"], frame: FrameName
     Seen space is told voxel by voxel. In unseen space p is linear between the centres of voxels, for a shape's wall is
     known no better than to a voxel; so where a shape ends at the table, it falls within the half voxel above.
     """
-    index = h.voxels(frame, *points.T)
+    cube = h.to_cube(frame, *points.T)
+    index = voxel_index(cube, h.grid)
     inside = index >= 0
     unseen = inside & h.unseen.ravel()[index]
     p = np.where(inside, h.p_occupied.ravel()[index], 0.0)
-    places = (h.to_cube(frame, *points[unseen].T) + 1.0) * (0.5 * h.grid) - 0.5
+    places = (cube[unseen] + 1.0) * (0.5 * h.grid) - 0.5  # in voxels, 0 at the first one's centre
     p[unseen] = np.clip(map_coordinates(h.p_occupied, places.T, order=1, mode="nearest"), 0.0, 1.0)
     if h.out_of_model:
         p = (1 - CAUTION) * p + CAUTION * unseen
