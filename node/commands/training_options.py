@@ -54,8 +54,11 @@ class Training:
         told = self.coordinator not in (None, "auto")
         if {told} != {self.processes is not None, self.process is not None}:
             raise ValueError("several processes need --coordinator HOST:PORT, --processes and --process; or auto alone")
-        if told and not re.fullmatch(r".+:\d+", str(self.coordinator)):
+        port = re.fullmatch(r".+:([0-9]{1,5})", str(self.coordinator))
+        if told and not (port and 0 < int(port[1]) < 1 << 16):  # gRPC waits for ever at another
             raise ValueError(f"--coordinator is {self.coordinator}; give HOST:PORT of process 0, or auto")
+        if self.processes is not None and self.processes < 1:
+            raise ValueError(f"--processes is {self.processes}; give 1 or more")
         if self.processes is not None and self.process is not None and not 0 <= self.process < self.processes:
             raise ValueError(f"--process is {self.process} of {self.processes}; give 0 to {self.processes - 1}")
 

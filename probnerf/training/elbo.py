@@ -1,11 +1,11 @@
 """ELBO training of a prior (paper §2.2): procedural objects in, ProbNeRF weights out. Two phases.
 
-Solid phase: the data are occupancy and surface colour at points (`solids`). It needs no pictures and costs a tenth of
-the ray phase. It trains the decoder. Ray phase: the data also include pixels of views. Their likelihood is the joint
-pixel likelihood of inference, on a lattice that is rotated, shifted and scaled at random. This phase also trains the
-picture encoder. The objective is an ELBO in both phases: N_points E[log p] + N_colours E[log p] + N_rays E[log p] -
-weight KL. Pixels are drawn by strata (object, near it, elsewhere) and weighted by each stratum's size. So the pixel
-term is an unbiased estimate of its mean over all pixels.
+Solid phase: the data are occupancy and surface colour at points (`solids`), also at points of other objects. It needs
+no pictures and costs a tenth of the ray phase. It trains the decoder. Ray phase: the data also include pixels of views.
+Their likelihood is the joint pixel likelihood of inference, on a lattice that is rotated, shifted and scaled at random.
+This phase also trains the picture encoder. The objective is an ELBO in both phases: N_points E[log p] + N_colours E[log
+p] + N_rays E[log p] - weight KL. Pixels are drawn by strata (object, near it, elsewhere) and weighted by each stratum's
+size. So the pixel term is an unbiased estimate of its mean over all pixels.
 
 In the paper, q(z) comes from pictures. Here it comes from `Recognition`, whose input is the object's exact description,
 and the decoder learns several times faster. The picture encoder learns to cover the recognised z (forward KL), so its
@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.sharding import Mesh
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from probnerf.likelihood.dispatch import map_with_gradient, weighted_terms
 from probnerf.likelihood.settings import Likelihood
@@ -39,10 +39,9 @@ from probnerf.training.pictures import ViewSet
 from probnerf.training.processes import everywhere, is_first, share_by_share, shares
 from probnerf.training.run_folder import RunFolder
 from probnerf.training.settings import TrainConfig
-from probnerf.training.shape_set import DESCRIPTION, ShapeBatch, ShapeSet, batch_of, draw_shapes
+from probnerf.training.shape_set import DESCRIPTION, ShapeBatch, ShapeSet, batch_of, draw_shapes, points_of_others
+from probnerf.training.solid_terms import colour_samples, solid_terms
 from probnerf.types import Observation, Pose, Rays
-
-BEHIND = 0.04  # cube units; a lattice of 32 can have a face this far behind a surface, so it needs colours there
 
 
 def encode(model: ProbNeRF, batch: Batch) -> tuple[Float[Array, "b k"], Float[Array, "b k"]]:
@@ -69,32 +68,6 @@ def encoder_loss(model: ProbNeRF, batch: Batch, z: Float[Array, "b k"]) -> Float
     mean, precision = encode(model, batch)
     z = jax.lax.stop_gradient(z)
     return -0.5 * jnp.mean(jnp.sum(jnp.log(precision) - precision * (z - mean) ** 2, axis=-1))
-
-
-def colour_samples(solids: ShapeBatch, key: PRNGKeyArray) -> tuple[Float[Array, "b m 3"], Float[Array, "b m 3"]]:
-    """Points slightly behind the surface, and directions from which a camera may see them."""
-    k0, k1 = jax.random.split(key)
-    normal = jnp.asarray(solids.normal)
-    points = jnp.asarray(solids.surface) - BEHIND * jax.random.uniform(k0, (*normal.shape[:2], 1)) * normal
-    view = jax.random.normal(k1, normal.shape)
-    view /= jnp.maximum(jnp.linalg.norm(view, axis=-1, keepdims=True), 1e-6)
-    return points, jnp.where(jnp.sum(view * normal, axis=-1, keepdims=True) > 0.0, -view, view)
-
-
-def _solid_terms(shared: tuple, item: tuple, weights: Array) -> Float[Array, ""]:
-    """Mean log-likelihoods of solid samples and of surface colours, each times its effective count."""
-    field, likelihood, config = shared
-    points, inside, place, view, rgb, valid = item
-    tau = field.density(weights, points) * foam.window(points) / likelihood.lattice.cubes
-    # a grazing ray crosses more faces outside, a finer lattice has thinner ones inside: both make walls sharper
-    probability = jnp.where(inside, -jnp.expm1(-tau / config.finer), jnp.exp(-config.grazing * tau))
-    eps = likelihood.mask_error
-    solid = jnp.mean(jnp.log(eps + (1.0 - 2.0 * eps) * probability))
-    sigma = jax.lax.stop_gradient(field.density(weights, place))
-    squared = jnp.sum((field.colour(weights, place, view, sigma) - rgb) ** 2, axis=-1)
-    counted = jnp.sum(jnp.where(valid, squared, 0.0)) / jnp.maximum(jnp.sum(valid), 1)
-    colour = -0.5 * counted / likelihood.colour_sigma**2
-    return config.effective_points * solid + config.effective_colours * colour
 
 
 class _ObjectRays(eqx.Module):
@@ -134,7 +107,7 @@ def _ray_terms(shared: tuple, item: tuple[_ObjectRays, tuple | None], weights: A
     )
     t = foam.crossings(rays, likelihood.lattice)
     fit = config.effective_rays * weighted_terms(field, weights, pose, likelihood, observation, t, seen.weight)
-    return fit if solids is None else fit + _solid_terms(shared, solids, weights)
+    return fit if solids is None else fit + solid_terms(shared, solids, weights)
 
 
 def _turn(pose: Pose, d: Array) -> Array:
@@ -164,7 +137,7 @@ def loss(
     are used. `mesh` holds the processes' devices that share the objects.
     """
     model, recognition = networks
-    k0, k1 = jax.random.split(key)
+    k0, k1, k2 = jax.random.split(key, 3)
     if solids is None:
         assert batch is not None, "neither solids nor rays"
         mean, precision = encode(model, batch)
@@ -175,9 +148,10 @@ def loss(
     weights = jax.vmap(model.hyper)(z)
     each: tuple | None = None
     if solids is not None:
-        each = (solids.points, solids.inside, *colour_samples(solids, k1), solids.rgb, solids.valid)
+        others = points_of_others(solids, k2, config.points_of_others) if config.points_of_others else None
+        each = (solids.points, solids.inside, *colour_samples(solids, k1), solids.rgb, solids.valid, others)
         each = jax.tree.map(jnp.asarray, each)
-    terms, encoder = _solid_terms, jnp.zeros(())
+    terms, encoder = solid_terms, jnp.zeros(())
     if batch is not None:
         drawn = (batch.origin, batch.direction, batch.ray_rgb, batch.ray_range, batch.ray_weight, batch.turn)
         terms, each = _ray_terms, (_ObjectRays(*map(jnp.asarray, drawn)), each)
@@ -236,12 +210,15 @@ def optimiser_of(config: TrainConfig) -> optax.GradientTransformation:
     def labels(networks: tuple[ProbNeRF, Recognition]) -> tuple[ProbNeRF, Recognition]:
         model, recognition = networks
         decoder = eqx.tree_at(lambda m: m.encoder, named("decoder", model), named("encoder", model.encoder))
-        return decoder, named("recognition", recognition)
+        if config.same_latents:
+            decoder = eqx.tree_at(lambda m: m.flow, decoder, named("still", model.flow))
+        return decoder, named("still" if config.same_latents else "recognition", recognition)
 
     rates = {
         "decoder": optax.adam(schedule(config.learning_rate, config.ray_learning_rate, config.frozen_steps)),
         "recognition": optax.adam(schedule(config.learning_rate, config.ray_learning_rate)),
         "encoder": optax.adam(schedule(config.learning_rate, config.learning_rate)),  # unused in the solid phase
+        "still": optax.set_to_zero(),
     }
     return optax.chain(optax.clip_by_global_norm(200.0), optax.multi_transform(rates, labels))
 
@@ -280,7 +257,7 @@ train_step = eqx.filter_jit(updated, donate="all-except-first")
 def train(
     model: ProbNeRF,
     solids: Sequence[tuple[ShapeSet, float]],
-    views: ViewSet,
+    views: ViewSet | None,
     likelihood: Likelihood,
     config: TrainConfig,
     folder: Path,
@@ -289,26 +266,31 @@ def train(
 ) -> Iterator[tuple[TrainState, dict[str, float]]]:
     """Run or resume in `folder`; yields (state, metrics) every `log_every` steps and appends them to history.jsonl.
 
-    `solids` are sets of shapes and their shares of each batch; `views` are pictures of the first set's first objects.
-    Without solids, there is no solid phase, and training uses only pictures. Raises FloatingPointError with the step if
-    the loss is not finite. The last checkpoint is kept. With a `mesh` (`processes.joined`), all processes call this
-    alike, and the first one reads and writes the folder.
+    `solids` are sets of shapes and their shares of each batch; `views` are pictures of the first set's first objects,
+    None where there is a solid phase alone. Without solids, there is no solid phase, and training uses only pictures.
+    Raises FloatingPointError with the step if the loss is not finite. The last checkpoint is kept. With a `mesh`
+    (`processes.joined`), all processes call this alike, and the first one reads and writes the folder.
     """
     if not solids and config.solid_steps:
         raise ValueError(f"solid_steps is {config.solid_steps}; it must be 0 where there are pictures alone")
-    if config.steps > config.solid_steps and views.rgb.shape[1] < config.views:
+    if views is None and config.steps > config.solid_steps:
+        raise ValueError(
+            f"solid_steps is {config.solid_steps}; it must be all {config.steps} steps where there are no pictures"
+        )
+    if views is not None and config.steps > config.solid_steps and views.rgb.shape[1] < config.views:
         raise ValueError(f"--views is {config.views} but objects have {views.rgb.shape[1]} pictures; give no more")
     run = RunFolder(folder, config)
     # a copy, because a step donates its input buffers
     state = initial_state(jax.tree.map(jnp.copy, model), config, jax.tree.map(jnp.copy, recognition))
     state = everywhere(run.resume(state) if is_first() else state, mesh)
-    strata = strata_of(views)
+    strata = None if views is None else strata_of(views)
     start = int(state.step)
 
     def data_of(step: int) -> tuple[ShapeBatch | None, Batch | None]:
         rng = np.random.default_rng([config.seed, step, 7])
         if step < config.solid_steps:
             return draw_shapes(solids, rng, config.batch, config.points, config.colours), None
+        assert views is not None and strata is not None
         batch = draw_batch(views, strata, config, step, config.ray_batch)
         if not solids:
             return None, batch

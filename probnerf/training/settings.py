@@ -1,6 +1,6 @@
 """The training recipe. Standard library only, because the command line reads it without JAX."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 
 @dataclass(frozen=True)
@@ -16,6 +16,7 @@ class TrainConfig:
     near_rays: int = 24  # free pixels within 2 pixels of the object
     far_rays: int = 8
     points: int = 512  # solid samples per object
+    points_of_others: int = 256  # solid samples per object at points of the batch's other objects
     colours: int = 192  # surface colours per object
     finer: float = 2.0  # solid samples must be opaque on a lattice that is finer by this factor
     grazing: float = 1.0  # empty samples must be transparent to a ray that crosses this many faces
@@ -28,11 +29,27 @@ class TrainConfig:
     warmup: int = 500
     level: float = 0.6  # share of a phase's steps after which its learning rate falls (by a half cosine)
     frozen_steps: int = 0  # first steps with a frozen decoder, to adapt recognition to an already trained one
+    same_latents: bool = False  # recognition and flow stay, so that a posterior network stays right; not the decoder
     kl_warmup: int = 2_000
     seed: int = 0
     checkpoint_every: int = 500
     log_every: int = 50
     map_batch: int | None = None  # objects per vectorised chunk of the field (None: one by one, best on a CPU)
+
+    def __post_init__(self) -> None:
+        names = "solid_steps near_rays far_rays points_of_others frozen_steps kl_warmup warmup seed"
+        least = dict.fromkeys(names.split(), 0)
+        for field in fields(self):
+            value, option = getattr(self, field.name), f"--{field.name.replace('_', '-')}"
+            if isinstance(value, bool):
+                continue
+            if isinstance(value, int) and not (low := least.get(field.name, 1)) <= value < 1 << 32:
+                raise ValueError(f"{option} is {value}; give {low} to {(1 << 32) - 1}")
+            if isinstance(value, float) and not 0.0 < value <= 1e9:
+                raise ValueError(f"{option} is {value:g}; give more than 0, and at most 1e9")
+        for name in ("learning_rate", "ray_learning_rate", "final_learning_rate", "level"):
+            if getattr(self, name) > 1.0:
+                raise ValueError(f"--{name.replace('_', '-')} is {getattr(self, name):g}; give at most 1")
 
 
 @dataclass(frozen=True)

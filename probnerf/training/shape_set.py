@@ -3,6 +3,8 @@
 One set holds objects of one family; the arrays are alike for all families, so training knows none of them.
 """
 
+import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -11,8 +13,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from foundation.one_line import one_line
 from foundation.whole_file import whole_file
 
 GRID, ANCHORS = 16, 6  # per axis: signed distances and colours that recognition reads
@@ -58,11 +61,13 @@ class ShapeSet:
 
 def load_shapes(path: Path) -> ShapeSet:
     """Raises FileNotFoundError or ValueError where there is no such set."""
-    with np.load(path, allow_pickle=False) as file:
-        missing = [f.name for f in fields(ShapeSet) if f.name not in file]
-        if missing:
-            raise ValueError(f"{path} is no set of shapes: it lacks {', '.join(missing)}; make it again")
-        return ShapeSet(**{f.name: file[f.name] for f in fields(ShapeSet)})
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            if missing := [f.name for f in fields(ShapeSet) if f.name not in file]:
+                raise ValueError(f"it lacks {', '.join(missing)}")
+            return ShapeSet(**{f.name: file[f.name] for f in fields(ShapeSet)})
+    except (zipfile.BadZipFile, zlib.error, EOFError, AttributeError, ValueError) as error:
+        raise ValueError(f"{path} is no set of shapes ({one_line(error)[:200]}); remove it and make it again") from None
 
 
 def joined(sets: Sequence[ShapeSet]) -> ShapeSet:
@@ -103,6 +108,31 @@ class ShapeBatch(eqx.Module):
     def description(self) -> Float[Array, "b d"]:
         """What recognition reads."""
         return jnp.concatenate([self.distance, self.anchor_rgb, self.appearance], axis=1)
+
+
+def points_of_others(
+    solids: ShapeBatch, key: PRNGKeyArray, count: int
+) -> tuple[Float[Array, "b m 3"], Bool[Array, "b m"], Bool[Array, "b m"]]:
+    """Points that other objects of the batch were asked at, whether each is inside this one, and whether that is sure.
+
+    An object's own points are near its surface, or anywhere, and seldom where only *other* objects are solid (a
+    handle). A decoder that learns from them alone gives a cup without a handle one. A distance changes by no more than
+    the way from the centres about it where it is known: where these do not tell the side, it is not sure.
+    """
+    k0, k1 = jax.random.split(key)
+    points = jnp.asarray(solids.points)
+    size, own = points.shape[:2]
+    other = (jnp.arange(size)[:, None] + jax.random.randint(k0, (size, count), 1, max(size, 2))) % size
+    points = points[other, jax.random.randint(k1, (size, count), 0, own)]
+    below = jnp.clip(jnp.floor((points + 1.0) * (GRID / 2.0) - 0.5).astype(jnp.int32), 0, GRID - 2)
+    least, most = jnp.full(points.shape[:2], -jnp.inf), jnp.full(points.shape[:2], jnp.inf)
+    for corner in np.ndindex(2, 2, 2):
+        cell = below + np.array(corner)
+        way = jnp.linalg.norm(points - ((cell + 0.5) * (2.0 / GRID) - 1.0), axis=-1)
+        at = (cell[..., 0] * GRID + cell[..., 1]) * GRID + cell[..., 2]
+        distance = CLIP * jnp.take_along_axis(jnp.asarray(solids.distance), at, axis=1)
+        least, most = jnp.maximum(least, distance - way), jnp.minimum(most, distance + way)
+    return points, most < 0.0, (least > 0.0) | (most < 0.0)
 
 
 DESCRIPTION = GRID**3 + 3 * ANCHORS**3 + PAINT_NUMBERS + TABLETOP_NUMBERS

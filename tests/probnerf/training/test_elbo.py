@@ -18,16 +18,18 @@ from probnerf.prior.checkpoint import load_prior, save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
 from probnerf.rendering import foam
 from probnerf.training.batches import draw_batch, strata_of
-from probnerf.training.elbo import TrainState, colour_samples, initial_state, loss, train
+from probnerf.training.elbo import TrainState, initial_state, loss, train
 from probnerf.training.pictures import ViewSet, draw_views
 from probnerf.training.settings import TrainConfig
-from probnerf.training.shape_set import ShapeSet, batch_of, in_cube
+from probnerf.training.shape_set import ShapeSet, batch_of, in_cube, points_of_others
+from probnerf.training.solid_terms import at_points_of_others, colour_samples
 from probnerf.training.tabletop_shapes import tabletop_shapes
 
 CONFIG = TrainConfig(
     steps=8, solid_steps=4, batch=4, ray_batch=2, views=2, object_rays=8, near_rays=4, far_rays=4,
     points=24, colours=8, warmup=2, checkpoint_every=3, log_every=1,
 )  # fmt: skip
+_distances = jax.jit(jax.vmap(signed_distance))
 Solids = list[tuple[ShapeSet, float]]
 LIKELIHOOD = Likelihood(lattice=foam.Lattice(8, 1.0))
 
@@ -73,6 +75,17 @@ def test_a_frozen_decoder_waits_for_recognition(solids: Solids, views: ViewSet, 
         assert all(map(np.array_equal, jax.tree.leaves(getattr(frozen.model, part)), start))
         assert not all(map(np.array_equal, jax.tree.leaves(getattr(moved.model, part)), start))
     assert np.any(frozen.recognition.output.weight != moved.recognition.output.weight)
+
+
+@pytest.mark.slow
+def test_the_same_latents_stay_while_the_decoder_learns(solids: Solids, tmp_path: Path) -> None:
+    config = replace(CONFIG, steps=4, same_latents=True)
+    *_, (state, _) = train(model(), solids, None, LIKELIHOOD, config, tmp_path)
+    begun = initial_state(model(), config)
+    for part in (lambda s: s.model.flow, lambda s: s.recognition, lambda s: s.model.encoder):
+        assert all(map(np.array_equal, jax.tree.leaves(part(state)), jax.tree.leaves(part(begun))))
+    moved = zip(jax.tree.leaves(state.model.hyper), jax.tree.leaves(begun.model.hyper), strict=True)
+    assert not any(np.array_equal(now, then) for now, then in moved if np.ndim(now) == 2)
 
 
 @pytest.mark.slow
@@ -129,19 +142,19 @@ def test_the_kernel_trains_as_plain_jax_does(solids: Solids, views: ViewSet, mon
 def test_solid_samples_are_what_the_objects_are(solids: Solids) -> None:
     """Surface points lie on the surface, normals have length 1, labels are the distance's sign, colours lie behind."""
     shapes, objects = solids[0][0], sample_objects(range(8))
-    distance = np.asarray(jax.vmap(signed_distance)(objects, jnp.asarray(in_cube(shapes.surface))))
+    distance = np.asarray(_distances(objects, jnp.asarray(in_cube(shapes.surface))))
     assert np.mean(shapes.valid) > 0.99
     assert np.abs(distance[shapes.valid]).max() < 2.2e-3
-    again = tabletop_shapes(np.array([3]))  # a function of the seed alone
+    again = tabletop_shapes(np.arange(3, 11))  # a function of its own seed alone
     np.testing.assert_array_equal(again.points[0], shapes.points[3])
 
     batch = batch_of(shapes, np.random.default_rng(0), np.arange(8), 400, 100)
     assert batch.points.shape == (8, 400, 3)
-    inside = np.asarray(jax.vmap(signed_distance)(objects, jnp.asarray(batch.points))) <= 0.0
+    inside = np.asarray(_distances(objects, jnp.asarray(batch.points))) <= 0.0
     assert np.mean(inside == batch.inside) > 0.999
     assert 0.1 < np.mean(inside) < 0.6
     place, view = colour_samples(batch, jax.random.key(1))
-    depth = -np.asarray(jax.vmap(signed_distance)(objects, place))[batch.valid]
+    depth = -np.asarray(_distances(objects, place))[batch.valid]
     assert np.mean((depth > -3e-3) & (depth < 0.043)) > 0.98
     np.testing.assert_allclose(np.linalg.norm(view, axis=-1), 1.0, atol=1e-5)
     assert np.asarray(batch.rgb).min() >= 0.0 and np.asarray(batch.rgb).max() <= 1.0
@@ -165,3 +178,31 @@ def test_a_prior_survives_its_file(tmp_path: Path) -> None:
     (tmp_path / "cut.safetensors").write_bytes((tmp_path / "p.safetensors").read_bytes()[:200])
     with pytest.raises(ValueError, match=r"cut\.safetensors is not a readable prior"):
         load_prior(tmp_path / "cut.safetensors")
+
+
+def test_what_is_sure_of_the_points_of_others_is_true(solids: Solids) -> None:
+    size = 8
+    batch = batch_of(solids[0][0], np.random.default_rng(0), np.arange(size), 64, 8)
+    points, inside, sure = map(np.asarray, points_of_others(batch, jax.random.key(0), 256))
+    objects = sample_objects(range(size))
+    distance = np.asarray(jax.vmap(signed_distance)(objects, jnp.asarray(points)))
+    assert np.array_equal(inside[sure], distance[sure] < 0.0)
+    assert np.all(sure[np.abs(distance) > 0.1]), "what is far from the surface is known"
+    assert np.mean(sure & (distance > 0.1)) > 0.3, "and others' points are often far"
+
+
+def test_what_is_opaque_in_free_space_is_pulled_down_however_opaque_it_is() -> None:
+    class Uniform:
+        def density(self, weights: jax.Array, points: jax.Array) -> jax.Array:
+            return jnp.broadcast_to(weights[0], points.shape[:-1])
+
+    points, sides = jnp.zeros((2, 3)), jnp.array([False, True])
+    config, factors = TrainConfig(), jnp.array([[0.1], [10.0], [1e4]])
+
+    def told(sure: list[bool]) -> np.ndarray:
+        shared, item = (Uniform(), LIKELIHOOD, config), (points, sides, jnp.array(sure))
+        slope = jax.vmap(jax.grad(lambda weights: at_points_of_others(shared, item, weights)))(factors)
+        return np.asarray(slope * factors)  # a relative change's
+
+    assert np.all(told([True, False]) < -0.01) and np.all(told([False, True]) >= 0.0)
+    assert np.all(told([False, False]) == 0.0)
