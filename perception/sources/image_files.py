@@ -1,5 +1,8 @@
 """Images and arrays as files: PNG, JPEG, .npy and .npz, checked before they are decoded."""
 
+import io
+import re
+import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -7,32 +10,28 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import simplejpeg
 from jaxtyping import Shaped, UInt8
+from PIL import Image
 
 from foundation.bounded import check_arrays
 from foundation.one_line import one_line
+from foundation.png import PNG_MAGIC, check_png
 from probnerf.environment import MOST_PIXELS
 
-_PNG_MAGIC, _JPEG_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+_JPEG_MAGIC = b"\xff\xd8\xff"
 LARGEST = MOST_PIXELS  # and values of an array
 _LARGEST_FILE = 1 << 29  # bytes
+_TOO_LARGE = f"it says that it is larger than {LARGEST} pixels"
+_MOST_SCANS = 100  # of a progressive JPEG, each of which takes as long as a picture
+_FILLING = 16  # bytes between the parts of a JPEG; webcams leave up to ten
 
 
 def read_png(path: Path) -> Shaped[np.ndarray, "h w *c"]:
     """The samples of a PNG, colours in OpenCV's order BGR(A). Raises where the file is absent, cut short or damaged."""
     data = _bytes(path)
-    if not data.startswith(_PNG_MAGIC):
+    if not data.startswith(PNG_MAGIC):
         raise ValueError(f"{path} is not a PNG; save it again as PNG")
-    # OpenCV fills missing data with zeros and only prints a warning, so the chunks are checked first.
-    at, kind = len(_PNG_MAGIC), b""
-    while kind != b"IEND":
-        size = int.from_bytes(data[at : at + 4], "big")
-        kind, end = data[at + 4 : at + 8], at + 12 + size
-        if end > len(data):
-            raise ValueError(f"{path} is cut short at byte {len(data)}; copy it again")
-        if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            raise ValueError(f"{path} is damaged near byte {at}; copy it again")
-        at = end
     return _decoded(path, data, "PNG")
 
 
@@ -40,8 +39,6 @@ def read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """The colours (RGB) of a PNG or JPEG. Raises as `read_png`."""
     data = _bytes(path)
     if data.startswith(_JPEG_MAGIC):
-        if not _is_whole_jpeg(data):
-            raise ValueError(f"{path} is cut short at byte {len(data)}; copy it again")
         image = _decoded(path, data, "JPEG")
     else:
         image = read_png(path)
@@ -116,51 +113,78 @@ def _decoded(path: Path, data: bytes, kind: str) -> Shaped[np.ndarray, "h w *c"]
     try:
         return decoded(data)
     except ValueError as error:
-        raise ValueError(f"{path} cannot be decoded ({error}); save it again as {kind}") from None
+        raise ValueError(f"{path} cannot be decoded ({error}); copy it again, or save it again as {kind}") from None
 
 
 def decoded(data: bytes) -> Shaped[np.ndarray, "h w *c"]:
     """The samples of a picture in any of OpenCV's formats, colours as BGR(A). Raises `ValueError` if there is none.
 
-    Of a PNG, size and data are looked at first, and the end of a JPEG: OpenCV takes missing pixels for black or grey.
+    Size, checksums and data are looked at here: OpenCV allocates what a header says, takes missing pixels for black or
+    grey, and what follows a damaged byte for pixels.
     """
-    if data.startswith(_PNG_MAGIC):
-        _check_png(data)
-    if data.startswith(_JPEG_MAGIC) and not _is_whole_jpeg(data):
-        raise ValueError(f"it is cut short at byte {len(data)}")
+    if data.startswith(_JPEG_MAGIC):
+        image = _decoded_jpeg(data)
+        if image is not None:
+            return image
+    elif data.startswith(PNG_MAGIC):
+        check_png(data, LARGEST)
+    else:
+        _check_size(data)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     except cv2.error as error:
         if "IO_MAX_IMAGE" in error.err:
-            raise ValueError(f"it says that it is larger than {LARGEST} pixels") from None
+            raise ValueError(_TOO_LARGE) from None
         raise ValueError(f"OpenCV: {error.err}") from None
     if image is None:
         raise ValueError("it is no picture, or damaged")
     return image
 
 
-def _is_whole_jpeg(data: bytes) -> bool:
-    return b"\xff\xd9" in data.rstrip(b"\0")[-64:]  # its last marker; drivers pad their buffers
+def _decoded_jpeg(data: bytes) -> UInt8[np.ndarray, "h w *c"] | None:
+    """The pixels of a JPEG, BGR or grey; None for four colours. Raises `ValueError` for one that is cut or damaged.
+
+    About half of single wrong bits leave data that fit still: they change one block, or shift what follows unseen.
+    """
+    if b"\xff\xd9" not in data.rstrip(b"\0")[-64:]:  # its last marker; drivers pad their buffers
+        raise ValueError(f"it is cut short at byte {len(data)}")
+    try:
+        height, width, colours, _ = simplejpeg.decode_jpeg_header(data)
+        if height * width > LARGEST:
+            raise ValueError(_TOO_LARGE)
+        if data.count(b"\xff\xda") > _MOST_SCANS:
+            raise ValueError(f"it has more than {_MOST_SCANS} scans")
+        if colours not in ("Gray", "YCbCr", "RGB"):
+            return None
+        space = "GRAY" if colours == "Gray" else "BGR"
+        try:
+            image = simplejpeg.decode_jpeg(data, space)
+        except ValueError as error:
+            found = re.search(r"(\d+) extraneous bytes before marker 0xd\d", str(error))
+            if not found or (int(found[1]) > _FILLING and not _is_filled(data, int(found[1]))):
+                raise ValueError(f"it is damaged: {error}") from None
+            image = simplejpeg.decode_jpeg(data, space, strict=False)
+    except RuntimeError as error:
+        raise ValueError(one_line(error)) from None
+    return image[..., 0] if space == "GRAY" else image
 
 
-def _check_png(data: bytes) -> None:
-    """Raises `ValueError` for a PNG that is too large, or has not as many pixels as it says."""
-    width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
-    bits, colours, interlaced = data[24:25], data[25:26], data[28:29]
-    if width * height > LARGEST:
-        raise ValueError(f"it is {width}x{height} px; give at most {LARGEST} pixels")
-    channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colours[0]) if colours else None
-    if not channels or interlaced != b"\0":  # an interlaced one's rows are counted otherwise
+def _is_filled(data: bytes, count: int) -> bool:
+    """Whether one byte is repeated so often before the end of a JPEG, as cameras do whose pictures have one size."""
+    end = data.rindex(b"\xff\xd9")
+    return len(set(data[end - count : end])) == 1
+
+
+def _check_size(data: bytes) -> None:
+    """Raises `ValueError` for a picture that says it is too large. One that Pillow does not know is left to OpenCV."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data)) as picture:
+                width, height = picture.size
+    except (Image.DecompressionBombWarning, Image.DecompressionBombError):
+        raise ValueError(_TOO_LARGE) from None
+    except Exception:  # whatever a plugin raises
         return
-    wanted = height * (1 + (width * channels * bits[0] + 7) // 8)
-    at, inflate, have = len(_PNG_MAGIC), zlib.decompressobj(), 0
-    while at + 12 <= len(data):
-        size, kind = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
-        if kind == b"IDAT":
-            try:
-                have += len(inflate.decompress(data[at + 8 : at + 8 + size], wanted + 1))
-            except zlib.error:
-                break
-        at += 12 + size
-    if have < wanted:
-        raise ValueError(f"its pixels end after {have} of {wanted} bytes")
+    if width * height > LARGEST:
+        raise ValueError(_TOO_LARGE)

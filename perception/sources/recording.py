@@ -9,7 +9,7 @@ import numpy as np
 from calibration.camera import Camera
 from perception.sources.frame import Frame
 from perception.sources.log_messages import INFO, Received, first_messages, open_log
-from perception.sources.ros_camera import to_camera
+from perception.sources.ros_camera import other_size, to_camera
 from perception.sources.ros_images import (
     POSE_TOPIC,
     stamp_ns,
@@ -57,6 +57,8 @@ class Log:
         self.path = Path(path)
         self.tolerance_ns = tolerance_ns
         self._pairing_notes: list[str] = []
+        self._broken: list[str] = []  # why an image cannot be read, so far
+        self._other_size: str | None = None  # why no camera may fit
         self._unread_infos: dict[str, None] = {}  # why, in the order of their coming
         self._read, kinds, self._notes = open_log(self.path)
         firsts = first_messages(self._read, kinds)
@@ -77,6 +79,7 @@ class Log:
             self._first_camera = camera
         elif self.info_topic is not None:
             self._first_camera = self._camera(firsts[self.info_topic])
+            self._other_size = other_size(firsts[self.info_topic].message, self._first_camera, self._colour)
         else:
             why = f"{self.path} has no camera_info; record the camera_info topic beside {self.colour_topic}, or give a"
             raise ValueError("; ".join([f"{why} camera file (--camera)", *self._notes]))
@@ -93,7 +96,11 @@ class Log:
     @property
     def notes(self) -> list[str]:
         """What was missing; those about pairing are there when an iteration has ended."""
-        return self._notes + self._pairing_notes
+        lost = []
+        if self._broken:
+            count = "1 image" if len(self._broken) == 1 else f"{len(self._broken)} images"
+            lost = [f"{count} that cannot be read left out; the first: {self._broken[0]}"]
+        return self._notes + lost + self._pairing_notes
 
     def close(self) -> None:
         """Nothing to do: a recording is open only while it is read."""
@@ -117,9 +124,8 @@ class Log:
 
         Raises `ValueError`, with the log's actual range, if it has no such frame.
         """
-        self._pairing_notes, self._unread_infos = [], {}
+        self._pairing_notes, self._unread_infos, self._broken = [], {}, []
         frames, unlabelled, first_ns, at = 0, 0, None, 0.0
-        broken: list[str] = []
         fallen = 0.0  # s; largest jump back of the stamps
         gaps: list[float] = []  # of the colour images that found no depth, ms
         for match in self._matches():
@@ -140,16 +146,13 @@ class Log:
             try:
                 frame = self._frame(colour, depth, label, pose, camera)
             except ValueError as error:
-                broken.append(str(error))
+                self._broken.append(str(error))
                 continue
             frames += 1
             unlabelled += self.label_topic is not None and label is None
             yield frame
-        if broken and not frames:
-            raise ValueError(broken[0])
-        if broken:
-            lost = "1 image" if len(broken) == 1 else f"{len(broken)} images"
-            self._pairing_notes.append(f"{lost} that cannot be read left out; the first: {broken[0]}")
+        if self._broken and not frames:
+            raise ValueError("; ".join(filter(None, [self._broken[0], self._other_size])))
         limit = f"{self.tolerance_ns / 1e6:g} ms"
         if gaps and not frames:
             raise ValueError(

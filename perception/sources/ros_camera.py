@@ -50,6 +50,23 @@ def to_camera(info: Any, rectified: bool) -> Camera:
     return _of_image(info, K, _filled(D, DISTORTION_LENGTHS.get(model, ())), model)
 
 
+def other_size(info: Any, camera: Camera, image: Any) -> str | None:
+    """Words for a CameraInfo whose `camera` has not the size of a raw image; None where it has, or none is known.
+
+    Some drivers crop without a roi, give it in joined pixels, or say `binning` of what is joined already.
+    """
+    size = getattr(image, "width", camera.width), getattr(image, "height", camera.height)
+    if size == (camera.width, camera.height):
+        return None
+    roi = getattr(info, "roi", None)
+    part = f"roi {roi.width}x{roi.height} at {roi.x_offset}, {roi.y_offset}" if roi is not None else "no roi"
+    binning = "x".join(str(getattr(info, f"binning_{axis}", 0)) for axis in "xy")
+    return (
+        f"its camera_info says {info.width}x{info.height} px with {part} (in pixels of the whole sensor) and binning"
+        f" {binning}, by which an image is {camera.width}x{camera.height}: mend the driver, or give --camera"
+    )
+
+
 def _filled(D: Float[np.ndarray, "d"], lengths: Sequence[int]) -> Float[np.ndarray, "d"]:
     """The coefficients in the next length that the model has; drivers leave the last zeros out, or add some."""
     if len(D) in lengths:

@@ -37,7 +37,7 @@ def test_colour_may_be_jpeg(folder: Path, frame: Frame) -> None:
     (folder / "rgb.jpg").write_bytes(data)
     assert np.abs(read_frame_folder(folder).rgb.astype(int) - frame.rgb).mean() < 4
     (folder / "rgb.jpg").write_bytes(data[: len(data) // 2])
-    with pytest.raises(ValueError, match=r"rgb\.jpg is cut short"):
+    with pytest.raises(ValueError, match=r"rgb\.jpg .* is cut short"):
         read_frame_folder(folder)
 
 

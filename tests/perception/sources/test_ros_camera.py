@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perception.sources.ros_camera import is_empty, to_camera
+from perception.sources.ros_camera import is_empty, other_size, to_camera
 
 K = np.array([[90.0, 0, 31], [0, 91, 23], [0, 0, 1]])
 BROWN = [0.1, -0.2, 0.01, 0.02, 0.03]
@@ -104,6 +104,26 @@ def test_a_roi_and_binning_of_zeros_is_the_whole_sensor() -> None:
     camera = to_camera(info("plumb_bob", BROWN, roi=none, binning_x=0, binning_y=0), rectified=False)
     assert (camera.width, camera.height) == (64, 48)
     np.testing.assert_array_equal(camera.K, K)
+
+
+def test_a_roi_is_in_pixels_of_the_whole_sensor_whatever_is_joined_or_rectified() -> None:
+    """sensor_msgs/CameraInfo: "A particular ROI always denotes the same window of pixels on the camera sensor"."""
+    for rectify in (False, True):
+        roi = SimpleNamespace(x_offset=8, y_offset=4, width=40, height=32, do_rectify=rectify)
+        parts = [to_camera(info("plumb_bob", BROWN, roi=roi, binning_x=n, binning_y=n), False) for n in (0, 1, 2, 4)]
+        assert [(c.width, c.height) for c in parts] == [(40, 32), (40, 32), (20, 16), (10, 8)]
+        corners = [c.rays(np.array([[-0.5, -0.5], [c.width - 0.5, c.height - 0.5]])) for c in parts]
+        for other in corners[1:]:
+            np.testing.assert_allclose(other, corners[0], atol=1e-9)
+
+
+def test_an_image_of_another_size_is_explained_by_what_its_driver_says() -> None:
+    image = SimpleNamespace(width=64, height=48)
+    joined = info("plumb_bob", BROWN, binning_x=2, binning_y=2)
+    said = other_size(joined, to_camera(joined, False), image)
+    assert said is not None and "64x48 px" in said and "binning 2x2" in said and "an image is 32x24" in said
+    assert other_size(info("plumb_bob", BROWN), to_camera(info("plumb_bob", BROWN), False), image) is None
+    assert other_size(joined, to_camera(joined, False), SimpleNamespace(format="jpeg")) is None
 
 
 def test_an_uncalibrated_camera_is_known() -> None:
