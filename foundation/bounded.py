@@ -13,7 +13,7 @@ import yaml
 from foundation.one_line import one_line
 
 MOST_VALUES = 100_000  # of a parsed text; aliases of YAML count as often as they are used
-LARGEST_ARRAY = 1 << 30  # bytes
+LARGEST_ARRAYS = 1 << 30  # bytes, of all arrays of a file
 LARGEST_YAML = 1 << 18  # bytes of text, which take seconds
 _LARGEST_TEXT = 1 << 24
 _MOST_LEVELS = 100
@@ -78,7 +78,9 @@ def parse_yaml(text: str) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """The content of a JSON text. Raises ValueError for what is no JSON, or is nested too deep."""
+    """The content of a JSON text. Raises ValueError for what is no JSON, is too large, or is nested too deep."""
+    if len(text) > _LARGEST_TEXT:
+        raise ValueError(f"it has more than {_LARGEST_TEXT >> 10} kB")
     try:
         return json.loads(text)
     except RecursionError:
@@ -99,11 +101,12 @@ def check_size(content: object) -> None:
             waiting.extend(value)
 
 
-def check_arrays(path: Path, names: Collection[str] | None = None, most: int = LARGEST_ARRAY) -> None:
-    """Raises ValueError where an array of an .npz file has more than `most` bytes, or not as many as it says.
+def check_arrays(path: Path, names: Collection[str] | None = None, most: int = LARGEST_ARRAYS) -> None:
+    """Raises ValueError where arrays of an .npz file have more than `most` bytes in all, or one not as many as it says.
 
     `names` are those that are looked at, in small letters; None: all. Raises zipfile.BadZipFile for another file.
     """
+    total = 0
     with zipfile.ZipFile(path) as archive:
         for info in archive.infolist():
             name = info.filename.removesuffix(".npy").lower()
@@ -120,5 +123,8 @@ def check_arrays(path: Path, names: Collection[str] | None = None, most: int = L
             size = math.prod(shape) * dtype.itemsize
             if not dtype.hasobject and size != held:
                 raise ValueError(f"{info.filename} says it has {size} bytes, and has {held}")
+            total += held
             if held > most:
                 raise ValueError(f"{info.filename} unpacks to {held >> 20} MB")
+            if total > most:
+                raise ValueError(f"its arrays unpack to more than {most >> 20} MB")

@@ -37,6 +37,7 @@ _SAMPLES = {
     **dict.fromkeys(("pose", "weights", "T_camera_object", "plane", "T_world_camera"), "f"),
     "population": "iu",
 }
+_ARRAYS = ("header", "opacity", "seen", *_SAMPLES)
 
 
 def hypotheses_path(folder: str | Path, object_id: int) -> Path:
@@ -119,9 +120,9 @@ def load(path: str | Path) -> Hypotheses:
         )
     damaged = f"{path} is damaged ({{}}); write it again with `farside replay`"
     try:
-        check_arrays(path)
+        check_arrays(path, {name.lower() for name in _ARRAYS})
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
+            arrays = {name: archive[name] for name in archive.files if name in _ARRAYS}
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError) as error:
         raise ValueError(damaged.format(error)) from error
     header = _header(path, arrays)

@@ -12,7 +12,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from foundation.bounded import parse_json
+from foundation.bounded import LARGEST_ARRAYS, parse_json
 from foundation.whole_file import write_whole
 from probnerf.prior.networks import PRESETS, ProbNeRF, Recognition
 from probnerf.prior.posterior_flow import NetworkSizes, PosteriorNetwork
@@ -183,6 +183,8 @@ def _halved(arrays: dict[str, np.ndarray], path: Path) -> dict[str, np.ndarray]:
 def _read(path: Path, what: str, remedy: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """A file's metadata and arrays."""
     try:
+        if (size := path.stat().st_size) > LARGEST_ARRAYS:
+            raise ValueError(f"it has {size >> 20} MB, more than any {what}")
         with safe_open(path, framework="np") as file:
             story = parse_json((file.metadata() or {}).get("farside", "{}"))
             if not isinstance(story, dict) or not all(isinstance(story.get(k, ""), str) for k in ("format", "preset")):
@@ -216,4 +218,5 @@ def _prior_path(path: Path | None) -> Path:
 
 
 def _hash(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]

@@ -35,6 +35,19 @@ def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path: Path) -> None:
     check_arrays(npz(tmp_path / "bomb.npz", (1001,), 1001), ["b"], most=1000)  # only what is asked for
 
 
+def test_arrays_that_unpack_to_too_much_together_are_refused(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "many.npz", **{f"a{i}": np.zeros(900, np.uint8) for i in range(9)})
+    check_arrays(tmp_path / "many.npz", most=8100)
+    check_arrays(tmp_path / "many.npz", ["a1", "a2"], most=1800)
+    with pytest.raises(ValueError, match="its arrays unpack to more than 0 MB"):
+        check_arrays(tmp_path / "many.npz", most=8099)
+
+
+def test_a_long_text_is_no_json() -> None:
+    with pytest.raises(ValueError, match="more than 16384 kB"):
+        parse_json(b"[" + 9_000_000 * b"0," + b"0]")
+
+
 def test_nested_text_is_an_error_and_no_crash() -> None:
     assert parse_json(b'{"a": [1, 2.5]}') == {"a": [1, 2.5]}
     with pytest.raises(ValueError, match="too deep"):

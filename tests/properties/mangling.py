@@ -14,6 +14,14 @@ import pytest
 from node.__main__ import main
 
 COUNT = int(os.environ.get("MANGLED", "40"))  # of each kind
+FIRST = int(os.environ.get("MANGLED_FIRST", "0"))  # seed
+
+
+def seeds(count: int = COUNT) -> range:
+    """So many seeds, from `FIRST`."""
+    return range(FIRST, FIRST + count)
+
+
 SECONDS, MEGABYTES = 20.0, 1500.0  # that one file, and all of a test's, may take
 VALUES = [None, True, -1, 0, 1e308, float("nan"), float("inf"), 10**30, "x", [], {}, [[1]], [1, 2, 3], {"a": 1}, 1e-300]
 _NUMBERS = [0, 1, 2, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**63 - 1, 2**64 - 1]  # lengths, counts, offsets

@@ -17,7 +17,7 @@ from perception.sources.frame_folder import write_frame_folder
 from perception.sources.recorder import write_log
 from tests.node.mugs import mug_hypotheses, table_frame
 from tests.perception.cylinders import CAN, picture
-from tests.properties.mangling import COUNT, VALUES, mangled, told
+from tests.properties.mangling import COUNT, VALUES, mangled, seeds, told
 
 KEYS = ("camera_matrix_std_px", "rms_px", "distortion_std", "depth_camera_matrix_px", "T_color_depth", "T_world_camera")
 
@@ -30,7 +30,7 @@ def frame_folder(tmp_path: Path) -> Path:
 
 def test_frame_folders(frame_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
     folder, out, codes = tmp_path / "f", tmp_path / "out.mcap", []
-    for seed in range(COUNT):
+    for seed in seeds():
         rng = random.Random(seed)
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(frame_folder, folder)
@@ -42,7 +42,7 @@ def test_frame_folders(frame_folder: Path, tmp_path: Path, capfd: pytest.Capture
 
 def test_values_of_meta_json(frame_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
     out, whole = tmp_path / "out.mcap", (frame_folder / "meta.json").read_text()
-    for seed in range(COUNT):
+    for seed in seeds():
         rng, meta = random.Random(seed), json.loads(whole)
         key, value = rng.choice([*meta, *KEYS]), rng.choice(VALUES)
         inner = meta.get(key)
@@ -60,7 +60,7 @@ def test_recordings(tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
     path, out, codes = tmp_path / "a.mcap", tmp_path / "out.mcap", []
     write_log(path, [picture(CAN)])
     whole = path.read_bytes()
-    for seed in range(COUNT):
+    for seed in seeds():
         path.write_bytes(mangled(whole, random.Random(seed)))
         codes.append(told(["record", str(path), "--out", str(out)], path, out, capfd))
     assert sum(codes) > 0.5 * COUNT
@@ -73,7 +73,7 @@ def test_hypotheses(tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
     whole = path.read_bytes()
     with np.load(path) as archive:
         arrays = dict(archive)
-    for seed in range(COUNT):
+    for seed in seeds():
         rng = random.Random(seed)
         if seed % 2:
             path.write_bytes(mangled(whole, rng))

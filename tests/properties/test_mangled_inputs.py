@@ -1,4 +1,4 @@
-"""Bags, weights, configurations, cameras, meshes and messages as a bad disk, a bad tool or an attacker makes them.
+"""Bags, weights, configurations, cameras, poses, pictures, meshes and messages as bad disks or attackers make them.
 
 Each is read, or refused in one line that names it, within seconds and bounded memory. Seeded; more of them by
 `MANGLED=2000 pytest tests/properties`.
@@ -12,6 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import cv2
 import jax
 import numpy as np
 import pytest
@@ -19,10 +20,12 @@ import trimesh
 import yaml
 
 from calibration.camera_file import read_camera, write_camera
+from calibration.pose_files import read_robot_poses
 from node.commands.config_file import load_config
 from node.commands.options import LiveConfig
 from node.ros.messages import HYPOTHESES, QUERY_REGION, decode, encode, frame_messages, hypotheses_from, make
 from node.ros.messages import hypotheses_message as message_of
+from perception.sources.image_files import decoded
 from perception.sources.ros_camera import to_camera
 from perception.sources.ros_images import to_depth, to_rgb
 from probnerf.objects.mesh import read_folder
@@ -31,7 +34,7 @@ from probnerf.prior.networks import PRESETS, ProbNeRF
 from tests.node.shapes import body_with_handle
 from tests.perception.cylinders import CAN, picture
 from tests.perception.sources.test_recording import maker, record
-from tests.properties.mangling import COUNT, another, bounded, mangled, refused, told
+from tests.properties.mangling import COUNT, another, bounded, mangled, refused, seeds, told
 
 LIVE = Path(__file__).parents[2] / "launch" / "live.yaml"
 
@@ -55,7 +58,7 @@ def test_bags(kind: str, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
     files = [path] if kind == "bag" else [next(path.glob("*.db3")), path / "metadata.yaml"]
     whole = {file: file.read_bytes() for file in files}
     told(["record", str(path), "--out", str(out)], path, out, capfd)
-    for seed in range(COUNT // 2):
+    for seed in seeds(COUNT // 2):
         rng = random.Random(seed)
         file = rng.choice(files)
         file.write_bytes(mangled(whole[file], rng))
@@ -71,7 +74,7 @@ def test_weights(tmp_path: Path) -> None:
     whole = path.read_bytes()
     size = struct.unpack("<Q", whole[:8])[0]
     header, data = json.loads(whole[8 : 8 + size]), whole[8 + size :]
-    for seed in range(COUNT):
+    for seed in seeds():
         rng = random.Random(seed)
         if seed % 3 == 0:
             path.write_bytes(mangled(whole, rng))
@@ -92,7 +95,7 @@ def test_weights(tmp_path: Path) -> None:
 def test_configurations(tmp_path: Path) -> None:
     path, codes, whole = tmp_path / "live.yaml", [], LIVE.read_bytes()
     values = json.loads(json.dumps(asdict(LiveConfig()), default=str))
-    for seed in range(COUNT):
+    for seed in seeds():
         rng = random.Random(seed)
         if seed % 3 == 0:
             path.write_bytes(mangled(whole, rng))
@@ -106,7 +109,7 @@ def test_cameras(tmp_path: Path) -> None:
     path, codes = tmp_path / "camera.yaml", []
     write_camera(path, picture(CAN).camera)
     whole = path.read_bytes()
-    for seed in range(2 * COUNT):
+    for seed in seeds(2 * COUNT):
         rng = random.Random(seed)
         changed = mangled(whole, rng) if seed % 2 else yaml.safe_dump(another(yaml.safe_load(whole), rng)).encode()
         path.write_bytes(changed)
@@ -122,11 +125,37 @@ def test_meshes(suffix: str, tmp_path: Path) -> None:
     box.export(whole)
     box.export(other)
     data = whole.read_bytes()
-    for seed in range(COUNT // 2):
+    for seed in seeds(COUNT // 2):
         whole.write_bytes(mangled(data, random.Random(seed)))
         found = dict(read_folder(tmp_path))
         assert isinstance(found["other"], trimesh.Trimesh)
         assert isinstance(found["a"], trimesh.Trimesh) or "\n" not in found["a"]
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tiff", ".webp", ".bmp"])
+def test_pictures(suffix: str) -> None:
+    """As a message or a file holds them."""
+    whole, codes = cv2.imencode(suffix, picture(CAN).rgb)[1].tobytes(), []
+    for seed in seeds(2 * COUNT):
+        data = mangled(whole, random.Random(seed))
+        codes.append(refused(lambda data=data: decoded(data), ""))  # type: ignore[misc]
+    assert sum(codes) > (0.4 * COUNT if suffix in (".jpg", ".png") else 0)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "json", "yaml"])
+def test_poses(suffix: str, tmp_path: Path) -> None:
+    """The robot's, for a hand-eye calibration."""
+    path, codes = tmp_path / f"poses.{suffix}", []
+    poses = [{"position": [0.1, 0.2, 0.3], "orientation": {"x": 0.0, "y": 0.6, "z": 0.0, "w": 0.8}}] * 3
+    text = "\n".join(["a.png,0.1,0.2,0.3,0,0.6,0,0.8"] * 3) if suffix == "csv" else json.dumps(poses)
+    for seed in seeds(2 * COUNT):
+        rng = random.Random(seed)
+        if seed % 2 or suffix == "csv":
+            path.write_bytes(mangled(text.encode(), rng))
+        else:
+            path.write_text(json.dumps(another(poses, rng)))
+        codes.append(refused(lambda: read_robot_poses(path), str(path)))
+    assert sum(codes) > 0.4 * COUNT
 
 
 def test_messages() -> None:
@@ -134,7 +163,7 @@ def test_messages() -> None:
     frame = picture(CAN)
     sent = [*frame_messages(frame).values(), message_of(body_with_handle()), make(f"{QUERY_REGION}_Request")]
     codes = []
-    for seed in range(2 * COUNT):
+    for seed in seeds(2 * COUNT):
         rng = random.Random(seed)
         message: Any = rng.choice(sent)
         kind, data = message.__msgtype__, bytes(encode(message))

@@ -53,3 +53,10 @@ def test_weights_that_are_no_finite_floats_are_refused(path: Path, spoil: Callab
     save_prior(path, jax.tree.map(lambda a: spoil(a) if a.ndim == 2 else a, load_prior(path).model), {})
     with pytest.raises(ValueError, match=rf"array \S+ is {why}"):
         load_prior(path)
+
+
+def test_a_file_that_is_too_large_for_weights_is_refused_unread(path: Path) -> None:
+    with path.open("r+b") as file:
+        file.truncate(1 << 34)
+    with pytest.raises(ValueError, match="has 16384 MB, more than any"):
+        load_prior(path)
