@@ -20,6 +20,7 @@ _KALIBRS = "DICT_APRILTAG_36h11"
 _KALIBRS_BORDER = 2  # modules; other tags have 1
 _AGREE_PX = 0.5
 _DISC = 0.25  # radius of a circle, of the distance to its nearest neighbour
+_MOST, _SMALLEST, _LARGEST = 100, 1e-4, 10.0  # columns or rows; a square, m
 # A view of fewer corners, or of corners in a line, has no pose.
 FEWEST_CORNERS = 8
 
@@ -117,6 +118,12 @@ class Board:
             for at in self.corners[:, :2] / self.square * px_per_square:
                 image[np.hypot(x - at[0], y - at[1]) < self.radius / self.square * px_per_square] = 0
         return image
+
+    @property
+    def twofold(self) -> bool:
+        """Whether it looks the same after half a turn, so that one picture does not tell which way it lies."""
+        alike = {"chessboard": (self.columns + self.rows) % 2 == 0, "asymmetric_circles": self.rows % 2 == 0}
+        return alike.get(self.kind, self.kind == "circles")
 
     @property
     def radius(self) -> float:
@@ -250,8 +257,10 @@ def parse_board(text: str) -> Board:
         square, marker = float(parts[1]), float(parts[2]) if len(parts) > 2 else 0.0
     except ValueError:
         raise ValueError(f"board {text!r} is not understood; give {_FORMS}") from None
-    if min(columns, rows) < 3 or not 0 < square < 10:
-        raise ValueError(f"board {text!r} needs 3 or more columns and rows, and a square in metres; give {_FORMS}")
+    if not (3 <= min(columns, rows) <= max(columns, rows) <= _MOST and _SMALLEST <= square < _LARGEST):
+        raise ValueError(
+            f"board {text[:80]!r} needs 3 to {_MOST} columns and rows, and a square in metres; give {_FORMS}"
+        )
     if kind in ("chessboard", "circles", "asymmetric_circles"):
         return Board(cast(Any, kind), columns, rows, square)
     if kind == "aprilgrid":
@@ -259,8 +268,11 @@ def parse_board(text: str) -> Board:
         if not 0.1 <= marker <= 1 or columns * rows > tags:
             raise ValueError(f"board {text!r} needs a gap of 0.1 to 1 tags, and at most {tags} tags; give {_FORMS}")
         return Board("aprilgrid", columns, rows, square * (1 + marker), square, _KALIBRS)
-    if not 0 < marker < square:
-        raise ValueError(f"board {text!r} has markers of {marker:g} m in squares of {square:g} m; give smaller markers")
+    if not 0.1 * square <= marker <= 0.98 * square:
+        raise ValueError(
+            f"board {text!r} has markers of {marker:g} m in squares of {square:g} m; give markers of a tenth of a"
+            " square or more, with a white edge"
+        )
     known = sorted(n for n in dir(cv2.aruco) if n.startswith("DICT_"))
     if parts[3] not in known:
         raise ValueError(f"board {text!r} names no dictionary; give one of {', '.join(known)}")

@@ -305,13 +305,18 @@ def _trouble(
         other: Eye = "to-hand" if eye == "in-hand" else "in-hand"
         turned = _solved(views, other)
         instead = float(np.sqrt(np.mean([v.rms_px(turned, camera) ** 2 for v in views])))
-        says = f"the corners miss their places by {rms:.0f} px (RMS), {config.rms * camera.width:.0f} px may be saved: "
-        if instead < 0.2 * rms:
+        limit = config.rms * camera.width
+        far = f"{rms:.0f} px (RMS)" if rms < camera.width else "more than the picture's width"
+        says = f"the corners miss their places by {far}, {limit:.0f} px may be saved: "
+        if instead < min(0.2 * rms, limit):
             return says + (
                 f"with --eye {other} they miss by {instead:.1f} px, so the camera is there, or the poses are inverted"
                 " (T_base_gripper is wanted)"
             )
-        return says + "are the poses those of these pictures, in metres, and did the board stay where it was?"
+        return says + (
+            "are the poses those of these pictures, in metres with quaternions x y z w, and did the board stay where it"
+            " was?"
+        )
     turn, shift = float(np.degrees(std[:3].max())), float(std[3:].max())
     if turn > config.turn_std or shift > config.shift_std:
         return (

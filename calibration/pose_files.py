@@ -1,6 +1,7 @@
 """Files of poses: the robot's at each picture, as field tools write them, and the result of a hand-eye calibration."""
 
 import csv
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ _FORMS = "x y z qx qy qz qw (metres; quaternion with w last) of T_base_gripper, 
 _COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _NAMES = ("picture", "image", "file", "filename", "name", "timestamp", "time", "stamp")
 _FAR = 100.0  # m; farther is millimetres
+_MOST = 10_000  # poses of a file
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,8 @@ def read_robot_poses(path: Path) -> list[RobotPose]:
     except ValueError as error:
         raise ValueError(f"{path} is no file of poses: {error}; give {_FORMS}") from None
     entries = _structured(path, text) if path.suffix.lower() in (".json", ".yaml", ".yml") else _rows(path, text)
+    if len(entries) > _MOST:
+        raise ValueError(f"{path} has {len(entries)} poses; give one for each picture, {_MOST} at most")
     poses: list[RobotPose] = []
     for name, entry in entries:
         where = f"{path}: pose {len(poses) + 1}" + ("" if name is None else f" ({name[:60]})")
@@ -132,9 +136,13 @@ def _matrix(entry: Any) -> Matrix:
     if values.size != 16:
         raise ValueError(f"it is {str(entry)[:80]}")
     T = values.reshape(4, 4)
-    if not np.allclose(T[3], [0, 0, 0, 1]) or not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3):
+    with np.errstate(all="ignore"):  # any numbers
+        turned = np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3)
+    if not turned or not np.allclose(T[3], [0, 0, 0, 1]):
         raise ValueError("its matrix is no rotation with a shift beside it and a last row 0 0 0 1")
-    return _rigid(T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat() if np.linalg.det(T[:3, :3]) > 0 else np.zeros(4))
+    if np.linalg.det(T[:3, :3]) < 0:
+        raise ValueError("its matrix mirrors: an axis points the wrong way")
+    return _rigid(T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat())
 
 
 def _of_parts(entry: Mapping[str, Any]) -> Matrix:
@@ -143,17 +151,21 @@ def _of_parts(entry: Mapping[str, Any]) -> Matrix:
         part = next((entry[n] for n in names if n in entry), None)
         if part is None:
             raise ValueError(f"it has no {' or '.join(names)}")
-        parts.append(np.array([part[a] for a in axes] if isinstance(part, Mapping) else part, np.float64))
+        if isinstance(part, Mapping):
+            if missing := [axis for axis in axes if axis not in part]:
+                raise ValueError(f"its {' or '.join(names)} has no {missing[0]}")
+            part = [part[axis] for axis in axes]
+        parts.append(np.array(part, np.float64))
     return _rigid(*parts)
 
 
 def _rigid(shift: np.ndarray, quaternion: np.ndarray) -> Matrix:
     if shift.shape != (3,) or quaternion.shape != (4,) or not np.isfinite([*shift, *quaternion]).all():
         raise ValueError("it is not three finite numbers and a quaternion of four")
-    if abs(np.linalg.norm(quaternion) - 1.0) > 1e-2:
+    if abs(math.hypot(*quaternion) - 1.0) > 1e-2:
         raise ValueError(f"its quaternion {quaternion.tolist()} has not the length 1")
-    if np.linalg.norm(shift) > _FAR:
-        raise ValueError(f"it is {np.linalg.norm(shift):g} m away; are these millimetres?")
+    if (far := math.hypot(*shift)) > _FAR:
+        raise ValueError(f"it is {far:g} m away; are these millimetres?")
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), shift
     return T

@@ -17,6 +17,7 @@ from calibration.coverage import Coverage, coverage, next_views
 from calibration.fit import BoardView
 from calibration.print_board import Paper, write_target
 from calibration.projection import Projection, projection
+from foundation.whole_file import check_folder
 from node.commands.calibration_options import Calibrate
 from node.figures.calibration_figure import draw_calibration
 from perception.sources.open_source import open_source
@@ -76,6 +77,7 @@ def check_output(path: Path) -> None:
         raise ValueError(f"--out is {path}; give a name that ends in .yaml")
     if path.is_dir():
         raise ValueError(f"--out is {path}, a folder; give a file")
+    check_folder(path.parent)
 
 
 def find_views(

@@ -27,6 +27,7 @@ def locate_camera(options: HandEyeOptions, out: Console, err: Console) -> None:
     source = options.source
     board = parse_board(options.board or DEFAULT_BOARD)
     check_output(options.out)
+    _check_frames(options)
     poses = read_robot_poses(options.poses)
     camera = None if options.camera is None else read_camera(options.camera)
     pictures, total = open_pictures(source)
@@ -34,10 +35,15 @@ def locate_camera(options: HandEyeOptions, out: Console, err: Console) -> None:
         raise ValueError(
             f"{source} is no folder of pictures; the robot stands still for each, so give one with a pose each"
         )
+    if board.twofold:
+        note = (
+            f"{board} looks the same after half a turn; keep it the same way up in all pictures, or use a ChArUco board"
+        )
+        err.print(f"note: {note}", highlight=False, soft_wrap=True)
     names: list[str] = []
     found = find_views(_named(pictures, names), board, err, total, Calibrate(source), CalibrateConfig())
     assert found.size is not None
-    posed = _posed(options, names, found.views, poses)
+    posed = _posed(options, names, found.views, poses, err)
     if camera is None:
         camera = _calibrated(source, found.views, found.size, err)
     elif (camera.width, camera.height) != found.size:
@@ -58,6 +64,17 @@ def locate_camera(options: HandEyeOptions, out: Console, err: Console) -> None:
     out.print(f"  {options.out}", highlight=False, soft_wrap=True)
 
 
+def _check_frames(options: HandEyeOptions) -> None:
+    parent = "--gripper-frame" if options.eye == "in-hand" else "--base-frame"
+    frames = {parent: options.gripper_frame if options.eye == "in-hand" else options.base_frame}
+    frames["--camera-frame"] = options.camera_frame
+    for option, name in frames.items():
+        if not name.strip("/ ") or not name.isprintable():
+            raise ValueError(f"{option} is {name!r}; give a frame's name")
+    if frames[parent] == options.camera_frame:
+        raise ValueError(f"{parent} and --camera-frame are both {options.camera_frame!r}; give each its own name")
+
+
 def _named(pictures: Iterator[Picture], names: list[str]) -> Iterator[Picture]:
     for picture in pictures:
         names.append(picture.name)
@@ -65,16 +82,21 @@ def _named(pictures: Iterator[Picture], names: list[str]) -> Iterator[Picture]:
 
 
 def _posed(
-    options: HandEyeOptions, names: list[str], views: Sequence[BoardView], poses: Sequence[RobotPose]
+    options: HandEyeOptions, names: list[str], views: Sequence[BoardView], poses: Sequence[RobotPose], err: Console
 ) -> list[PosedView]:
-    """The views that have a pose: by the picture's name where one is named in the file, else by their order."""
+    """The views that have a pose: by the picture's name where one is named in the file, else by their order.
+
+    What has no partner is told to `err`. Raises ValueError where a picture has two poses.
+    """
     known = {name: name for name in names} | {Path(name).stem: name for name in names}
-    by_name = dict[str, RobotPose]()
+    by_name, lone = dict[str, RobotPose](), list[str]()
     for pose in poses:
         path = Path(pose.picture or "")
-        for name in (path.name, path.stem):
-            if name in known:
-                by_name.setdefault(known[name], pose)
+        name = next((known[part] for part in (path.name, path.stem) if part in known), None)
+        if name is None:
+            lone.append(str(pose.picture)[:60])
+        elif not np.allclose(by_name.setdefault(name, pose).T_base_gripper, pose.T_base_gripper):
+            raise ValueError(f"{options.poses} has two poses of {name}; give the one at which it was taken")
     words = [p.picture for p in poses if p.picture and not p.picture.replace(".", "").isdigit()]
     if words and not by_name:
         raise ValueError(
@@ -86,7 +108,11 @@ def _posed(
                 f"{options.poses} has {len(poses)} poses, but {options.source} has {len(names)} pictures; give one for"
                 " each in the order of their names, or name the picture beside each pose"
             )
-        by_name = dict(zip(names, poses, strict=True))
+        by_name, lone = dict(zip(names, poses, strict=True)), []
+    without = [name for name in names if name not in by_name]
+    for what, left in (("pictures have no pose", without), ("poses name no picture", lone)):
+        if left:
+            err.print(f"note: {len(left)} {what}: {', '.join(left[:5])}", highlight=False, soft_wrap=True)
     return [PosedView(v, by_name[v.name].T_base_gripper) for v in views if v.name in by_name]
 
 

@@ -86,11 +86,16 @@ def test_the_text_names_the_board(text: str) -> None:
         ("chessboard:8:0.1", "not understood"),
         ("chessboard:8x6:wide", "not understood"),
         ("checkerboard:8x6:0.1", "not understood"),
-        ("chessboard:2x6:0.1", "3 or more"),
+        ("chessboard:2x6:0.1", "3 to 100 columns"),
         ("chessboard:8x6:108", "in metres"),
         ("chessboard:8x6:nan", "in metres"),
-        ("charuco:7x5:0.03:0.04:DICT_5X5_100", "smaller markers"),
+        ("charuco:7x5:0.03:0.04:DICT_5X5_100", "give markers of"),
         ("charuco:7x5:0.04:0.03:DICT_5X5_99", "DICT_5X5_100"),
+        ("chessboard:101x6:0.1", "3 to 100 columns"),
+        (f"chessboard:{10**19}x6:0.1", "3 to 100 columns"),
+        ("chessboard:8x6:1e-300", "in metres"),
+        ("charuco:7x5:0.035:0.0349999999:DICT_5X5_100", "with a white edge"),
+        ("charuco:7x5:0.035:1e-9:DICT_5X5_100", "a tenth of a square"),
         ("circles:7x5", "not understood"),
         ("aprilgrid:6x6:0.03:3", "a gap of 0.1 to 1 tags"),
         ("charuco:30x20:0.04:0.03:DICT_5X5_100", "needs 300 markers"),
@@ -100,3 +105,10 @@ def test_a_wrong_text_is_refused(text: str, says: str) -> None:
     with pytest.raises(ValueError, match=says) as caught:
         parse_board(text)
     assert repr(text) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", BOARDS)
+def test_a_board_that_looks_the_same_after_half_a_turn_says_so(text: str) -> None:
+    board = parse_board(text)
+    picture = board.picture(20)
+    assert board.twofold == np.array_equal(picture, picture[::-1, ::-1])

@@ -47,8 +47,8 @@ def asked(session: Path, out: Path, *more: str, poses: Path | None = None) -> li
 def refused(args: list[str], capsys: pytest.CaptureFixture) -> str:
     capsys.readouterr()
     assert main(args) == 1
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith("farside: error: ")
+    *notes, line = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("farside: error: ") and all(note.startswith("note: ") for note in notes)
     return line
 
 
@@ -102,7 +102,22 @@ def test_what_is_wrong_is_named_and_nothing_is_written(
     wxyz = "\n".join(",".join([*row[:4], row[7], *row[4:7]]) for row in rows)
     assert "quaternions x y z w" in says(wxyz) or "miss their places" in says(wxyz)
     assert "ends in .yaml" in refused(asked(session, tmp_path / "h.txt"), capsys)
+    far = "\n".join(",".join([row[0], *(str(100 * float(v)) for v in row[1:4]), *row[4:]]) for row in rows)
+    assert "more than the picture's width" in (line := says(far)) and "to-hand" not in line
+    assert "two poses of 02.png" in says(whole + "\n" + ",".join(["02.png", *rows[3][1:]]))
+    for name in ("", "a\nb", "/", "\udcff"):
+        assert f"--camera-frame is {name!r}" in says(whole, "--camera-frame", name)
+    assert "are both 'a'" in says(whole, "--camera-frame", "a", "--gripper-frame", "a")
+    assert "is a file; give a folder" in refused(asked(session, session / "camera.yaml" / "h.yaml"), capsys)
     assert "in none of 8 pictures" in refused(asked(session, out, "--board", "chessboard:9x9:0.1"), capsys)
+
+
+def test_what_has_no_partner_is_told(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    text = (session / "poses.csv").read_text()
+    (tmp_path / "p.csv").write_text(text.replace("03.png", "99.png") + "\n" + text.splitlines()[0])
+    assert main(asked(session, tmp_path / "h.yaml", poses=tmp_path / "p.csv")) == 0
+    said = capsys.readouterr().err
+    assert "1 pictures have no pose: 03.png" in said and "1 poses name no picture: 99.png" in said
 
 
 def test_the_node_tells_all_where_its_camera_is(session: Path, tmp_path: Path) -> None:
