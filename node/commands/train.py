@@ -5,7 +5,7 @@ import os
 import subprocess
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -65,10 +65,11 @@ def _train(options: Training, mesh: Mesh | None, out: Console, err: Console) -> 
         config = replace(config, solid_steps=0, ray_learning_rate=config.learning_rate)
     if not 1 <= options.objects <= len(TRAIN_SEEDS):
         raise ValueError(f"--objects is {options.objects}; give 1 to {len(TRAIN_SEEDS)}")
-    if options.pictured < 1:
-        raise ValueError(f"--pictured is {options.pictured}; give 1 or more")
-    if options.pictures is not None and options.pictures < 1:
-        raise ValueError(f"--pictures is {options.pictures}; give 1 or more")
+    if not 0 <= options.household <= len(TRAIN_SEEDS):
+        raise ValueError(f"--household is {options.household}; give 0 to {len(TRAIN_SEEDS)}")
+    for name in ("pictured", "pictures", "variants"):
+        if (value := getattr(options, name)) is not None and value < 1:
+            raise ValueError(f"--{name} is {value}; give 1 or more")
     begun = None if options.start is None else load_prior(options.start, preset=options.preset)
     recognition = None
     if options.start is not None and begun is not None and recognition_path(options.start).is_file():
@@ -119,8 +120,12 @@ def drawn_curves(folder: Path, out: Console) -> Iterator[None]:
     finally:
         history, curves = folder / "history.jsonl", folder / "curves.png"
         if is_first() and history.is_file() and (lines := history.read_text(encoding="utf-8").splitlines()):
-            draw_training(curves, [json.loads(line) for line in lines])
-            out.print(str(curves), highlight=False, soft_wrap=True)
+            rows = list[dict[str, Any]]()
+            with suppress(ValueError):  # a line that is damaged, which the run itself has named
+                rows = [json.loads(line) for line in lines]
+            if rows:
+                draw_training(curves, rows)
+                out.print(str(curves), highlight=False, soft_wrap=True)
 
 
 def learnt_objects(run: Path) -> dict[str, Any]:

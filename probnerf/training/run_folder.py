@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import equinox as eqx
 
+from foundation.one_line import one_line
 from foundation.whole_file import whole_file
 
 S = TypeVar("S")
@@ -25,7 +26,7 @@ class RunFolder:
         """The checkpoint's state, or `state` in a new folder.
 
         `state` has an array `step`. Later lines of the history are removed. Raises ValueError if the folder holds a run
-        of another recipe.
+        of another recipe, or a checkpoint that cannot be read.
         """
         self._folder.mkdir(parents=True, exist_ok=True)
         if self.checkpoint.exists():
@@ -33,10 +34,20 @@ class RunFolder:
                 raise ValueError(
                     f"{self._folder} holds a run of another recipe: see {self._settings}, or give a fresh --out"
                 )
-            state = eqx.tree_deserialise_leaves(self.checkpoint, state)
-            lines = self._history.read_text().splitlines() if self._history.exists() else []
-            step = int(state.step)  # type: ignore[attr-defined]
-            self._history.write_text("".join(line + "\n" for line in lines if json.loads(line)["step"] <= step))
+            try:
+                state = eqx.tree_deserialise_leaves(self.checkpoint, state)
+                step = int(state.step)  # type: ignore[attr-defined]
+            except Exception as error:  # NumPy's and Equinox's readers fail in many ways
+                raise ValueError(
+                    f"{self.checkpoint} is damaged, or of another model ({one_line(error)[:200]}); remove it to begin"
+                    " anew, or give a fresh --out"
+                ) from None
+            try:
+                lines = self._history.read_text().splitlines() if self._history.exists() else []
+                kept = [line for line in lines if json.loads(line)["step"] <= step]
+            except (KeyError, TypeError, ValueError, RecursionError):
+                raise ValueError(f"{self._history} is damaged; remove it, and the curves begin here") from None
+            self._history.write_text("".join(line + "\n" for line in kept))
         self._settings.write_text(self._described)
         return state
 

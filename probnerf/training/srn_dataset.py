@@ -10,6 +10,7 @@ tabletop family, put an object's base 0.375 scale below the barycentre and make 
 centres are at +0.5.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,14 +19,16 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from foundation.png import PNG_MAGIC, check_png
 from foundation.whole_file import write_whole
+from probnerf.environment import MOST_PIXELS
 from probnerf.geometry import look_at, rigid
 from probnerf.prior.encoder_input import ENCODER_RADIUS
 from probnerf.training.pictures import ViewSet
 
 NO_RANGE = -1.0  # in a ViewSet: an object pixel whose distance is unknown
 _WHITE = 250  # without alpha, a pixel is background if all its samples are at least this
-_PNG_END = b"IEND\xaeB`\x82"
+_FARTHEST = 1e4  # cube units
 _MOST_SAMPLES = 8  # per pixel and axis, when a picture is reduced
 _LINES = ("f cx cy 0", "barycentre", "scale", "height width")
 
@@ -174,14 +177,14 @@ def read_views(
 def _square(instance: Instance, view: int, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """rgb, mask, T_cube_camera and tangent of the half field of view of one view, at `size` pixels a side."""
     rgb, mask, T = instance.rgb[view], instance.mask[view], instance.T_cube_camera[view]
+    distance = math.hypot(*T[:3, 3])
+    where = f"{instance.name}: view {view} is {distance:.3g} cube units from the cube's centre"
+    if not distance <= _FARTHEST:
+        raise ValueError(f"{where}, where no object is seen; check its pose, and the scale in intrinsics.txt")
     if mask.shape == (size, size) and instance.centre == (0.5 * size, 0.5 * size):
         return rgb, mask, T, 0.5 * size / instance.focal
-    distance = float(np.linalg.norm(T[:3, 3]))
     if distance < 1.1 * ENCODER_RADIUS:
-        raise ValueError(
-            f"{instance.name}: view {view} is {distance:.2f} cube units from the cube's centre, in the object's midst;"
-            " check the barycentre and the scale in intrinsics.txt"
-        )
+        raise ValueError(f"{where}, in the object's midst; check the barycentre and the scale in intrinsics.txt")
     tangent = ENCODER_RADIUS / distance
     T_new = look_at(T[:3, 3], np.zeros(3))
     finer = int(np.clip(np.ceil(instance.focal * tangent / (0.5 * size)), 1, _MOST_SAMPLES))
@@ -227,6 +230,10 @@ def _read_intrinsics(
     for line, name, value in ((1, "f", f), (3, "scale", scale), (4, "height", height), (4, "width", width)):
         if value <= 0:
             raise ValueError(f"{path}, line {line}: {name} is {value:g}; it must be positive")
+    if height % 1 or width % 1:
+        raise ValueError(f"{path}, line 4: {height:g}x{width:g} px are no whole numbers; write the pictures' size")
+    if height * width > MOST_PIXELS:
+        raise ValueError(f"{path}, line 4: {height:g}x{width:g} px are more than {MOST_PIXELS}; give smaller pictures")
     inverted = len(lines) > len(_LINES) and _numbers(path, lines[4], 5, (1,), "0 or 1")[0] == 1
     x, y, z = barycentre
     return f, (cx, cy), (x, y, z), scale, (int(height), int(width)), inverted
@@ -241,8 +248,12 @@ def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
 
 def _read_picture(path: Path, size: tuple[int, int]) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     data = path.read_bytes()
-    if not data.endswith(_PNG_END):  # OpenCV would fill missing rows with zeros
-        raise ValueError(f"{path} is cut short, or no PNG; copy it again")
+    try:
+        if not data.startswith(PNG_MAGIC):
+            raise ValueError("it is no PNG")
+        check_png(data, MOST_PIXELS)
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be read ({error}); copy it again") from None
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise ValueError(f"{path} is damaged; copy it again")

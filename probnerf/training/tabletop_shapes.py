@@ -31,10 +31,10 @@ _HANDLE_SHARE = 4  # one in this many is drawn around the handle, which fills a 
 
 def tabletop_shapes(seeds: np.ndarray, progress: Callable[[int, int], None] | None = None) -> ShapeSet:
     """The objects of `seeds`. Each depends only on its own."""
-    parts, block = [], 256
+    parts, block = [], min(256, 1 << (len(seeds) - 1).bit_length())
     for start in range(0, len(seeds), block):
         chosen = seeds[start : start + block]
-        padded = np.resize(chosen, block)  # one compiled size
+        padded = np.resize(chosen, block)  # few compiled sizes
         objects = sample_objects([int(s) for s in padded])
         parts.append(_shapes(objects, padded)[: len(chosen)])
         if progress is not None:

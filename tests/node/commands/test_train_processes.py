@@ -113,6 +113,8 @@ def test_options_that_do_not_go_together_are_named() -> None:
     for options in ({"coordinator": "here:1"}, {"process": 0}, {"coordinator": "auto", "processes": 2, "process": 0}):
         with pytest.raises(ValueError, match="several processes need --coordinator HOST:PORT"):
             Training(**options)
+    with pytest.raises(ValueError, match="--coordinator is here:99999; give HOST:PORT"):
+        Training(coordinator="here:99999", processes=2, process=0)
     with pytest.raises(ValueError, match="--coordinator is here; give HOST:PORT"):
         Training(coordinator="here", processes=2, process=0)
     with pytest.raises(ValueError, match="--process is 2 of 2; give 0 to 1"):

@@ -21,6 +21,9 @@ from probnerf.objects.tabletop_sampler import BOTTLE, CAN, CARTON, KINDS, MUG, P
 from probnerf.types import BASE_Z, BODY_EXTENT
 
 MANY = range(300)
+_distance, _parts = jax.jit(signed_distance), jax.jit(part_distances)
+_distances = jax.jit(jax.vmap(signed_distance, (0, None)))
+_gradients = jax.jit(jax.vmap(jax.vmap(jax.grad(signed_distance, 1), (None, 0)), (0, None)))
 
 
 @pytest.fixture(scope="module")
@@ -102,12 +105,12 @@ def test_slack_moves_the_object_but_keeps_its_shape() -> None:
     points = jax.random.uniform(jax.random.key(0), (500, 3), minval=-1.0, maxval=1.0)
     base = jnp.array([0.0, 0.0, BASE_Z])
     moved = loose.scale * (points - base) + base + jnp.array([*loose.shift, 0.0])
-    np.testing.assert_allclose(signed_distance(loose, moved), loose.scale * signed_distance(tight, points), atol=2e-6)
+    np.testing.assert_allclose(_distance(loose, moved), loose.scale * _distance(tight, points), atol=2e-6)
 
 
 def test_distance_agrees_with_a_slow_one(one_of_each: TabletopObject) -> None:
     points = np.random.default_rng(1).uniform(-1.1, 1.1, (1500, 3))
-    fast = np.asarray(jax.vmap(signed_distance, (0, None))(one_of_each, jnp.asarray(points, jnp.float32)))
+    fast = np.asarray(_distances(one_of_each, jnp.asarray(points, jnp.float32)))
     for i in range(len(fast)):
         slow = _slow_distance(_float64(one_of_each, i), points)
         np.testing.assert_allclose(fast[i], slow, atol=1e-5)
@@ -116,9 +119,9 @@ def test_distance_agrees_with_a_slow_one(one_of_each: TabletopObject) -> None:
 def test_distance_is_1_lipschitz_with_unit_gradient_outside(one_of_each: TabletopObject) -> None:
     a, b = jax.random.uniform(jax.random.key(2), (2, 2000, 3), minval=-1.2, maxval=1.2)
     b = a + 0.1 * (b - a)
-    far, near = (jax.vmap(signed_distance, (0, None))(one_of_each, p) for p in (b, a))
+    far, near = (_distances(one_of_each, p) for p in (b, a))
     assert jnp.all(jnp.abs(far - near) <= jnp.linalg.norm(b - a, axis=-1) * (1 + 1e-4) + 1e-6)
-    gradient = jax.vmap(jax.vmap(jax.grad(signed_distance, 1), (None, 0)), (0, None))(one_of_each, a)
+    gradient = _gradients(one_of_each, a)
     norm = jnp.linalg.norm(gradient, axis=-1)
     # Only ties between parts or edges, of measure zero, may differ.
     assert jnp.mean(jnp.abs(jnp.where(near > 1e-3, norm, 1.0) - 1.0) > 1e-3) < 1e-3
@@ -190,7 +193,7 @@ def test_bodies_stand_on_the_plane_and_have_the_agreed_extent(canonical: Tableto
     points = jax.random.uniform(
         jax.random.key(6), (1000, 3), minval=jnp.array([-1.3, -1.3, -1.0]), maxval=jnp.array([1.3, 1.3, 1.2])
     )
-    inside = jax.vmap(signed_distance, (0, None))(canonical, points) < 0.0
+    inside = _distances(canonical, points) < 0.0
     outside_box = jnp.any(
         (points < canonical.lower[:, None] - 1e-5) | (points > canonical.upper[:, None] + 1e-5), axis=-1
     )
@@ -209,12 +212,12 @@ def test_handles_point_to_plus_x_and_leave_a_hole(canonical: TabletopObject) -> 
         tube = np.asarray(obj.tube)
         z = tube[len(tube) // 2, 1]
         row = np.stack([np.linspace(0.1, 1.2, 400), np.zeros(400), np.full(400, z)], -1).astype(np.float32)
-        body, handle = (np.asarray(d) for d in part_distances(obj, row))
+        body, handle = (np.asarray(d) for d in _parts(obj, row))
         wall_end, handle_start = np.flatnonzero(body < 0).max(), np.flatnonzero(handle < 0).min()
         assert handle_start > wall_end and np.minimum(body, handle)[wall_end:handle_start].max() > 0.015
         # It is attached: near both ends of its centre line body and handle overlap.
         ends = jnp.stack([jnp.array([x, 0.0, z]) for x, z in (tube[0], tube[-1])])
-        assert jnp.all(part_distances(obj, ends)[0] < obj.tube_section[0])
+        assert jnp.all(_parts(obj, ends)[0] < obj.tube_section[0])
 
 
 def test_frequencies_and_solids_by_kind(many: TabletopObject) -> None:
@@ -232,7 +235,7 @@ def test_solid_truth_contains_what_the_distance_contains(one_of_each: TabletopOb
     points = jnp.asarray(np.stack(np.meshgrid(centre, centre, centre, indexing="ij"), -1), jnp.float32)
     for i in range(one_of_each.kind.shape[0]):
         obj = jax.tree.map(lambda leaf, i=i: leaf[i], one_of_each)
-        solid, distance = np.asarray(solid_occupancy(obj, grid)), np.asarray(signed_distance(obj, points))
+        solid, distance = np.asarray(solid_occupancy(obj, grid)), np.asarray(_distance(obj, points))
         half_diagonal = np.sqrt(3) / grid
         assert np.all(solid[distance <= 0.0]) and not np.any(solid[distance > half_diagonal + 1e-6])
         assert not np.any(np.asarray(handle_occupancy(obj, grid)) & ~solid)
