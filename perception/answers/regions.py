@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import binary_fill_holes
 
 REACH = 1e6  # m; a region may lie so far from the frame's origin. Farther, sizes and volumes overflow
 MOST_CELLS = 20_000_000  # of the box about a mesh
-_MOST_PIECES = 2_000_000  # no larger than a cell, of a mesh's triangles
+_MOST_POINTS, _POINTS_AT_ONCE = 20_000_000, 1_000_000  # of a mesh's triangles, half a cell apart
 _MESHES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf")  # trimesh unpacks archives, too
 
 
@@ -147,26 +148,50 @@ def read_mesh(path: Path, width: float) -> Cells:
         raise ValueError(f"{path} cannot be read as a mesh ({error}); export it again as .obj, .stl or .ply") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise ValueError(f"{path} holds no triangles; export it as a triangle mesh (points go to --points)")
-    if not (finite := np.isfinite(mesh.vertices).all(axis=1)).all():
-        row = int(np.flatnonzero(~finite)[0])
-        raise ValueError(f"{path}: vertex {row + 1} is {mesh.vertices[row].tolist()}; give finite numbers, in metres")
+    if not (near := (np.abs(mesh.vertices) <= REACH).all(axis=1)).all():
+        row, numbers = int(np.flatnonzero(~near)[0]), f"give finite numbers up to {REACH:g}, in metres"
+        raise ValueError(f"{path}: vertex {row + 1} is {mesh.vertices[row].tolist()}; {numbers}")
     cells = float(np.prod(np.ceil(mesh.extents / width) + 1))
     if cells > MOST_CELLS:
         size = " x ".join(f"{e:g}" for e in mesh.extents)
         raise ValueError(
             f"{path} is {size} m large: too large to be filled with cells of {width:g} m; is it in metres?"
         )
-    if int(mesh.faces.min()) < 0:
-        raise ValueError(f"{path} has a triangle of vertex {int(mesh.faces.min())}; export it again")
-    longest = mesh.edges_unique_length[mesh.faces_unique_edges].max(axis=1)
-    pieces = float((4.0 ** np.ceil(np.log2(np.maximum(longest / width, 1.0)))).sum())  # trimesh halves the edges
-    if pieces > _MOST_PIECES:
+    if not 0 <= int(mesh.faces.min()) <= int(mesh.faces.max()) < len(mesh.vertices):
+        raise ValueError(f"{path} has a triangle of a vertex that is not there; export it again")
+    corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]
+    met = _met(corners, width)
+    if met is None:
         raise ValueError(
             f"{path} has {len(mesh.faces)} triangles that meet too many cells of {width:g} m; keep what is near the"
             " objects, or simplify it (is it in metres?)"
         )
-    try:
-        filled = mesh.voxelized(width).fill("holes")
-    except ValueError as error:
-        raise ValueError(f"{path} cannot be filled ({error}); export it again, with shorter triangles") from None
-    return Cells(np.asarray(filled.points, np.float64), width)
+    grid, first = met
+    return Cells(width * (np.argwhere(binary_fill_holes(grid)) + first), width)
+
+
+def _met(corners: Float[np.ndarray, "f 3 3"], width: float) -> tuple[Bool[np.ndarray, "x y z"], np.ndarray] | None:
+    """The cells about whole multiples of `width` that triangles meet, and the first one's; None if they are too many.
+
+    By points of each triangle in rows along its longest edge, no more than half a cell apart.
+    """
+    edges = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)  # from each corner to the next
+    turn = (edges.argmax(axis=1)[:, None] + np.arange(3)) % 3
+    a, b, apex = np.moveaxis(np.take_along_axis(corners, turn[:, :, None], axis=1), 1, 0)
+    height = np.linalg.norm(np.cross(b - a, apex - a), axis=1) / np.maximum(edges.max(axis=1), 1e-300)
+    across, down = (np.ceil(np.maximum(length / (0.5 * width), 1.0)) for length in (edges.max(axis=1), height))
+    counts = (across + 1) * (down + 1)
+    if counts.sum() > _MOST_POINTS:
+        return None
+    low, high = (np.rint(bound(corners, axis=(0, 1)) / width).astype(int) for bound in (np.min, np.max))
+    grid = np.zeros(high - low + 1, bool)
+    chunk = np.cumsum(counts) // _POINTS_AT_ONCE
+    for rows in np.split(np.arange(len(corners)), np.flatnonzero(np.diff(chunk)) + 1):
+        each = counts[rows].astype(int)
+        row = np.repeat(rows, each)
+        number = np.arange(len(row)) - np.repeat(np.cumsum(each) - each, each)
+        v, u = np.divmod(number, across[row].astype(int) + 1)
+        along = a[row] + (u / across[row])[:, None] * (b - a)[row]
+        points = apex[row] + (v / down[row])[:, None] * (along - apex[row])
+        grid[tuple((np.rint(points / width).astype(int) - low).T)] = True
+    return grid, low

@@ -1,5 +1,6 @@
 """A mesh as a region: what it fills is asked, whole, and a file that is none is named."""
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -124,7 +125,7 @@ def test_points_are_read_and_bad_lines_named(tmp_path):
     ("name", "text", "why"),
     [
         ("long.obj", "v 0 0 0\nv 40000 0 0\nv 0 0.001 0\nf 1 2 3\n", "too large|too many cells"),
-        ("many.obj", "v 0 0 0\nv .02 0 0\nv 0 .02 0\n" + "f 1 2 3\n" * 100_000, "100000 triangles"),
+        ("many.obj", "v 0 0 0\nv .2 0 0\nv 0 .2 0\n" + "f 1 2 3\n" * 100_000, "100000 triangles"),
         ("a.zip", "PK", "no mesh by its name"),
         ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 -3\n", "vertex -3|cannot be read|no triangles"),
     ],
@@ -134,3 +135,27 @@ def test_a_mesh_that_takes_too_long_or_is_none_is_named(tmp_path: Path, name: st
     with pytest.raises(ValueError, match=why) as caught:
         read_mesh(tmp_path / name, 0.004)
     assert name in str(caught.value)
+
+
+def test_a_mesh_meets_every_cell_that_its_surface_crosses_and_no_far_one(tmp_path: Path) -> None:
+    rng, width = np.random.default_rng(0), 0.004
+    soup = trimesh.Trimesh(rng.uniform(-0.05, 0.05, (60, 3)), np.arange(60).reshape(20, 3), process=False)
+    cells = np.rint(read_mesh(_saved(tmp_path / "soup.ply", soup), width).centres / width).astype(int)
+    met = {tuple(cell) for cell in cells}
+    points, _ = trimesh.sample.sample_surface(soup, 200_000, seed=0)
+    inner = points[(np.abs(points / width - np.rint(points / width)) < 0.25).all(axis=1)]  # far from a cell's faces
+    assert len(inner) > 10_000 and {tuple(cell) for cell in np.rint(inner / width).astype(int)} <= met
+    distance = trimesh.proximity.ProximityQuery(soup).on_surface(width * cells[::17])[1]
+    assert (distance <= 0.5 * np.sqrt(3.0) * width + 1e-6).mean() > 0.99  # of the others, the soup encloses them
+
+
+def test_a_large_tray_is_filled_in_seconds(tmp_path: Path) -> None:
+    """0.8 m, of few and long triangles."""
+    outer, inner = trimesh.creation.box((0.8, 0.8, 0.05)), trimesh.creation.box((0.792, 0.792, 0.05))
+    inner.apply_translation((0.0, 0.0, 0.004))
+    inner.invert()
+    path = _saved(tmp_path / "tray.stl", trimesh.util.concatenate([outer, inner]))
+    begun = time.monotonic()
+    cells = read_mesh(path, 0.002)
+    assert time.monotonic() - begun < 20.0
+    assert len(cells.centres) > 400 * 400
