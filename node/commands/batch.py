@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from foundation.bounded import parse_json
+from foundation.one_line import one_line
 from foundation.store import Store, bytes_of
 from node.commands.batch_logs import find_logs
 from node.commands.batch_options import BatchConfig
@@ -47,7 +48,7 @@ def batch(
     `runner` takes the place of processes, `infer` that of `perception.inference.controller.estimate`. Raises
     `ValueError` or `OSError` in one line, before any inference, for errors of the input and the place.
     """
-    if config.out is None:
+    if not config.out:
         raise ValueError("there is no place for the results; give --out FOLDER, or a URL")
     store = Store(config.out)
     if store.in_memory and runner is None:
@@ -214,7 +215,7 @@ def _table(store: Store, settings: str | None, out: Console) -> int:
     if not store.has(SETTINGS):
         raise FileNotFoundError(f"{store.url} holds no results of `farside batch`; give the --out of a run")
     sizes = store.sizes()
-    kept = store.read([SETTINGS])[SETTINGS].decode()
+    kept = _kept(store)
     table = make_table(store, settings or _digest(kept), kept, sizes)
     failed = table["result"].to_pylist().count("failed")
     files = [size for name, size in sizes.items() if re.search(r"^logs/.*\.(json|npz)$", name)]
@@ -240,18 +241,27 @@ def _claimed(store: Store, settings: dict[str, Any]) -> str:
     text = json.dumps(settings, sort_keys=True, default=str, indent=1)
     if not store.has(SETTINGS):
         store.write(SETTINGS, text.encode())
-    kept = store.read([SETTINGS])[SETTINGS].decode()
+    kept = _kept(store)
     if kept != text:
-        try:
-            before, after = dict(_leaves(json.loads(kept))), dict(_leaves(json.loads(text)))
-        except ValueError:
-            raise ValueError(f"{store.path(SETTINGS)} is damaged; give another --out") from None
+        before, after = dict(_leaves(parse_json(kept))), dict(_leaves(parse_json(text)))
         name = next(name for name in sorted(before | after) if before.get(name, ...) != after.get(name, ...))
-        raise ValueError(
-            f"{store.url} holds results with {name} {before.get(name)}, and this is {after.get(name)}; give that, or"
-            " another --out"
-        )
+        old, new = (str(values.get(name))[:80] for values in (before, after))
+        raise ValueError(f"{store.url} holds results with {name} {old}, and this is {new}; give that, or another --out")
     return _digest(kept)
+
+
+def _kept(store: Store) -> str:
+    """The settings that the place holds. Raises `ValueError` where they are damaged, or of another version's format."""
+    try:
+        kept = store.read([SETTINGS])[SETTINGS].decode()
+        values = parse_json(kept)
+        if not isinstance(values, dict):
+            raise ValueError("it is no mapping")
+    except ValueError as error:
+        raise ValueError(f"{store.path(SETTINGS)} is damaged ({one_line(error)[:200]}); give another --out") from None
+    if (found := values.get("format")) != FORMAT:
+        raise ValueError(f"{store.path(SETTINGS)} has format {str(found)[:40]!r}, not {FORMAT}; give another --out")
+    return kept
 
 
 def _digest(settings: str) -> str:

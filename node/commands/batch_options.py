@@ -67,7 +67,7 @@ class BatchConfig(FrameOptions):
         """Which of how many parts of the work is to be done. Raises `ValueError` for a shard that is none."""
         if self.shard is None:
             return 0, 1
-        if (found := re.fullmatch(r"(\d{1,9})/(\d{1,9})", self.shard)) is None:
+        if (found := re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", self.shard)) is None:
             raise ValueError(f"the shard is {self.shard!r}; give I/N, such as 0/8")
         i, n = int(found[1]), int(found[2])
         if i >= n:

@@ -1,7 +1,6 @@
 """The table of `farside batch`: a row for each unit, from the units' records."""
 
 import io
-import json
 import re
 from collections.abc import Collection
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from foundation.bounded import parse_json
 from foundation.store import Store
 from node.commands.batch_task import Record
 from probnerf.types import KINDS
@@ -50,12 +50,15 @@ def make_table(store: Store, settings: str, description: str, sizes: Collection[
     rows = list[dict[str, Any]]()
     for name, content in store.read(names).items():
         try:
-            record = json.loads(content)
+            record = parse_json(content)
             if record["settings"] != settings:
                 raise ValueError("it is of other settings")
             rows += _rows(name, record)
-        except (KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{store.path(name)} is no record of this run ({error}); remove it") from None
+    for row in rows:
+        if not isinstance(row["log"], str):
+            raise ValueError(f"{store.url} holds a record of {str(row['log'])[:80]}, which is no log; remove it")
     rows.sort(key=lambda row: (row["log"], row.get("object") or -1, -1 if row.get("seed") is None else row["seed"]))
     table = pa.Table.from_pylist(rows, SCHEMA.with_metadata({"farside": description}))
     file = io.BytesIO()

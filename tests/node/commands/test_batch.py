@@ -168,6 +168,28 @@ def test_what_failed_is_done_again_on_request_alone(given: BatchConfig) -> None:
     assert not list(Path(given.out).rglob("object*.failed.json"))
 
 
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"", "is damaged"),
+        (b"\xff\x00", "is damaged"),
+        (b"[]", "is damaged"),
+        (b"[" * 100_000, "is damaged"),
+        (b"[" + 9_000_000 * b"0," + b"0]", "is damaged"),
+        (b'{"format": "farside-batch-99"}', "has format 'farside-batch-99', not farside-batch-1; give another"),
+    ],
+    ids=["empty", "no text", "list", "nested", "huge", "newer"],
+)
+def test_settings_that_cannot_be_read_are_named(given: BatchConfig, content: bytes, why: str) -> None:
+    settings = Path(given.out) / "settings.json"
+    settings.parent.mkdir(parents=True, exist_ok=True)
+    settings.write_bytes(content)
+    for config in (given, replace(given, table_only=True)):
+        with pytest.raises(ValueError, match=rf"settings\.json {why}") as caught:
+            batch(config, Console(), Console())
+        assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
+
+
 def test_other_settings_and_other_logs_do_not_mix_in(given: BatchConfig, logs: Path, tmp_path: Path) -> None:
     log = tmp_path / "my.mcap"
     log.write_bytes((logs / "run.mcap").read_bytes())

@@ -59,7 +59,7 @@ def run(config: BatchConfig) -> tuple[int, str]:
 def test_a_killed_worker_changes_no_result(given: BatchConfig, deaths: Path, tmp_path: Path) -> None:
     assert batch(given, Console(file=io.StringIO()), Console(file=io.StringIO()), here, pretend_estimate) == 0
     (deaths / "1").touch()
-    code, text = run(replace(given, workers=2, out=str(tmp_path / "two")))
+    code, text = run(replace(given, out=str(tmp_path / "two")))
     assert code == 0 and "4 units done" in text and not list(deaths.iterdir())
     assert "object 2 seed 0: process" in text and "was ended by signal 9 (Killed); tried again" in text
     assert (tmp_path / "two" / "table.parquet").read_bytes() == (tmp_path / "alone" / "table.parquet").read_bytes()
