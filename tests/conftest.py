@@ -31,7 +31,10 @@ farside.prepare = lambda: None  # what it sets would reach all tests of this pro
 def pytest_configure(config: pytest.Config) -> None:
     """The default tests compile more than they compute: they optimise little. Slow ones run the code that users run."""
     if config.option.markexpr == "not slow":
-        quick = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
+        quick = (
+            "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1 "
+            "--xla_cpu_parallel_codegen_split_count=1"  # small programs: to split one takes longer than to compile it
+        )
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {quick}".strip()
         os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # level 0, but for the fixture `optimised`
 
@@ -68,6 +71,13 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("no recorded data: ../shared/data is not beside this checkout")
     return folder
+
+
+def pytest_collection_finish() -> None:
+    """Python need not look for garbage in what was imported, nor through all that lives at every tenth look."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

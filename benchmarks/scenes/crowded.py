@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
@@ -18,6 +19,8 @@ GAP = 0.01  # m between the circles that bodies stand in
 VIEW = ViewConfig(elevation=(30.0, 50.0), distance=(1.0, 1.2), aim=0.0)  # of the middle of the things
 LEAST = 500  # px of a thing in sight, without which it is not asked for
 MARGIN, BEHIND, DRAWN, SCORED = 0.03, 0.005, 20_000, 2000  # m about its box, m behind what is seen; points
+
+_distance = jax.jit(signed_distance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,12 +80,12 @@ def hidden_points(made: Crowd, object_id: int) -> tuple[Float[np.ndarray, "n 3"]
     inside = np.all((px >= 0) & (px < [camera.width, camera.height]), axis=1)
     u, v = np.where(inside[:, None], px, 0).astype(int).T
     keep = np.flatnonzero(inside & (points[:, 2] >= made.depth[v, u] + BEHIND))[:SCORED]
-    return points[keep], np.asarray(signed_distance(placed.shape, jnp.asarray(cube[keep]))) <= 0.0
+    return points[keep], np.asarray(_distance(placed.shape, jnp.asarray(cube[keep]))) <= 0.0
 
 
 def _box(placed: PlacedObject) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Corners of the box about a thing, cube units, to a twentieth."""
     ticks = np.linspace(-1.0, 1.0, 41)
     points = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-    solid = points[np.asarray(signed_distance(placed.shape, jnp.asarray(points))) <= 0.025]
+    solid = points[np.asarray(_distance(placed.shape, jnp.asarray(points))) <= 0.025]
     return solid.min(axis=0), solid.max(axis=0)

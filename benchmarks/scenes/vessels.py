@@ -224,9 +224,14 @@ def pixels_of_handle(view: VesselPicture) -> int:
     return int(_on_handle(view.placed.shape, points.astype(np.float32)).sum())
 
 
+_part_distances = jax.jit(part_distances)
+
+
 def _on_handle(obj: TabletopObject, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
     """Which surface points belong to the handle: it is the nearer part, by more than rounding."""
-    body, handle = (np.asarray(a) for a in part_distances(obj, jnp.asarray(points)))
+    count = len(points)
+    padded = np.resize(points, (1 << max(count - 1, 0).bit_length(), 3))  # few compiled sizes
+    body, handle = (np.asarray(a)[:count] for a in _part_distances(obj, padded))
     return (handle < body) & (body > 0.004)
 
 

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import cv2
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -46,6 +47,9 @@ def write_folder(folder: Path, frame: Frame, **changes: np.ndarray) -> Path:
     return folder
 
 
+_distance = jax.jit(lambda shape, pose, points: signed_distance(shape, pose.to_object(points)))
+
+
 def mug_hypotheses(
     frame: Frame, found: Segment, yaws: list[float], weights: list[float], grid: int = 32, **changes
 ) -> Hypotheses:
@@ -78,5 +82,5 @@ def mug_hypotheses(
 
 def _opacity(yaw: float, scale: float, grid: int) -> np.ndarray:
     pose = Pose(*(jnp.asarray(v) for v in (yaw, 0.0, 0.0, scale, 0.0)))
-    distance = np.asarray(signed_distance(MUG.shape, pose.to_object(jnp.asarray(voxel_centres(grid)))))
+    distance = np.asarray(_distance(MUG.shape, pose, jnp.asarray(voxel_centres(grid))))
     return np.where(distance <= 0.0, 255, 0).astype(np.uint8)

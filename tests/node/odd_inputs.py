@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from perception.sources.frame_folder import write_frame_folder
 from tests.node.mugs import table_frame
 from tests.perception.sources.test_compressed_depth import rvl
 from tests.perception.sources.test_recording import maker, record
@@ -77,7 +78,8 @@ def stamped(seconds: int) -> list[Any]:
 
 
 def log(messages: list[Any]) -> Callable[[Path], list[str]]:
-    return lambda folder: [str(record(folder / "log", "mcap", messages))]
+    """As one file: a folder's metadata take longer to read than all else."""
+    return lambda folder: [str(next(record(folder / "log", "mcap", messages).glob("*.mcap")))]
 
 
 def beside(name: str, text: str, option: str) -> Callable[[Path], list[str]]:
@@ -97,6 +99,19 @@ def arrays(**changed: np.ndarray) -> Callable[[Path], list[str]]:
         return [str(folder / "frame.npz")]
 
     return write
+
+
+def damaged_jpeg() -> bytes:
+    """The frame's colours with 700 bytes lost on the way."""
+    jpeg = cv2.imencode(".jpg", RGB[..., ::-1])[1].tobytes()
+    return jpeg[: len(jpeg) // 2] + jpeg[len(jpeg) // 2 + 700 :]
+
+
+def folder_with_damaged_jpeg(folder: Path) -> list[str]:
+    write_frame_folder(folder / "frame", FRAME)
+    (folder / "frame" / "color.png").unlink()
+    (folder / "frame" / "rgb.jpg").write_bytes(damaged_jpeg())
+    return [str(folder / "frame")]
 
 
 def odd_inputs() -> Iterator[Odd]:
@@ -130,6 +145,12 @@ def _colours() -> Iterator[tuple[str, str, list[Any]]]:
     topic = f"{COLOUR}/compressed"
     for form in ("jpeg", "", "rgb8; jpeg compressed bgr8", "bgr8;jpeg compressed", "mjpeg", "image/jpeg"):
         yield f"JPEG, format {form!r}", READ, [info(), packed(jpeg, form, topic), depth()]
+    damaged = [packed(bytes(data), "jpeg", topic) for data in (damaged_jpeg(), jpeg)]
+    damaged[1][3].header.stamp.nanosec += 500 * MS
+    after = [depth(), depth()]
+    after[1][3].header.stamp.nanosec += 500 * MS
+    yield "JPEG, damaged in the middle", "damaged: Corrupt JPEG data", [info(), damaged[0], depth()]
+    yield "JPEG, the first of two damaged", "1 image that cannot be read left out", [info(), *damaged, *after]
     for ending in ("png", "tiff", "webp", "bmp"):
         data = cv2.imencode(f".{ending}", bgr)[1].tobytes()
         yield f"{ending} in a message", READ, [info(), packed(data, f"rgb8; {ending} compressed bgr8", topic), depth()]
@@ -207,6 +228,13 @@ def _cameras() -> Iterator[tuple[str, str, list[Any]]]:
     shifted = K + np.array([[0, 0, 30], [0, 0, 20], [0, 0, 0]])
     yield of("part of the sensor (roi)", k=shifted, width=400, height=300, roi=(30, 20, WIDTH, HEIGHT))
     double = K * [[2.0], [2.0], [1.0]] + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    whole = {"width": 400, "height": 300}
+    yield of("roi of zeros with an offset", roi=(30, 20, 0, 0))
+    yield of("roi that is the whole sensor", roi=(0, 0, WIDTH, HEIGHT))
+    yield of("cropped without a roi", "camera_info says 400x300 px with roi 0x0 at 0, 0", k=shifted, **whole)
+    yield of("roi beyond the sensor", "principal point", k=shifted, roi=(300, 200, WIDTH, HEIGHT), **whole)
+    yield of("binning of what is binned already", "and binning 2x2, by which", binning_x=2, binning_y=2)
+    yield of("binning 1x0", binning_x=1)
     yield of("binned", k=double, width=2 * WIDTH, height=2 * HEIGHT, binning_x=2, binning_y=2)
     rectified = colour(topic="/cam/color/image_rect_color")
     yield "rectified, P zero", READ, [info(p=np.zeros(12)), rectified, depth()]
@@ -240,6 +268,9 @@ def _files() -> Iterator[Odd]:
     for name, (text, expected) in texts.items():
         for what, option in (("camera file", "--camera"), ("configuration", "--config")):
             yield Odd("file", f"{what}: {name}", expected, beside("a.yaml", text, option))
+    yield Odd(
+        "file", "frame folder: JPEG damaged in the middle", "damaged: Corrupt JPEG data", folder_with_damaged_jpeg
+    )
     turned = np.eye(4)
     turned[3, 0] = 0.1
     yield Odd("file", "npz: pose transposed", "no rotation", arrays(T_world_camera=turned))

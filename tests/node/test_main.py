@@ -181,7 +181,7 @@ def _spoil(folder: Path, what: str, frame: Frame) -> None:
 @pytest.mark.parametrize(
     ("what", "says"),
     [
-        ("truncated colour", r"color\.png is cut short at byte 500; copy it again"),
+        ("truncated colour", r"color\.png cannot be decoded \(it is cut short at byte 500\); copy it again"),
         ("other size", r"depth\.png is 120x90 px but the colour is 240x180; align"),
         ("no depth", r"no pixel of 43200 has depth; check the depth sensor"),
         ("tiny mask", r"object 1 has 9 pixels, .* at least 50 are needed: move the camera nearer"),

@@ -9,8 +9,7 @@ import pytest
 from benchmarks.paper import grids
 from benchmarks.paper.conditioned import PLACES, SIZE, Conditioned
 from benchmarks.paper.families import CARS
-from benchmarks.paper.grids import ACROSS, AHEAD, DOWN, Options, answer_rows, deviation, main, sample_rows
-from benchmarks.paper.judged import DRAWS
+from benchmarks.paper.grids import AHEAD, DOWN, Options, answer_rows, deviation, main, sample_rows
 from benchmarks.paper.methods import HMC, PRIOR, Effort
 from probnerf.prior.checkpoint import save_prior
 from probnerf.prior.networks import PRESETS, ProbNeRF
@@ -31,21 +30,24 @@ def test_a_map_is_the_deviation_between_draws() -> None:
     assert np.count_nonzero(found) == 1
 
 
-def test_rows_are_truth_draws_and_map(model: ProbNeRF) -> None:
+def test_rows_are_truth_draws_and_map(model: ProbNeRF, monkeypatch: pytest.MonkeyPatch, draws: int = 3) -> None:
+    monkeypatch.setattr(grids, "DRAWS", draws)
+    monkeypatch.setattr(grids, "CHAINS", draws)
     view = Conditioned(CARS, 2_000_000, PLACES["cars"][0], TINY.image_size)
     for method, last in ((PRIOR, False), (HMC, True)):
         given, hidden = answer_rows(view, model, Effort(2, 2, 3), method, last)
         assert given[0].endswith("given") and hidden[0].endswith("hidden side")
-        assert [p.shape for p in given[1]] == [(SIZE, SIZE, 3)] * (1 + DRAWS) + [(SIZE, SIZE)]
+        assert [p.shape for p in given[1]] == [(SIZE, SIZE, 3)] * (1 + draws) + [(SIZE, SIZE)]
         np.testing.assert_array_equal(given[1][0], view.given.rgb[0] / 255.0)
         np.testing.assert_array_equal(hidden[1][0], view.held_out.rgb[AHEAD] / 255.0)
         np.testing.assert_allclose(given[1][-1], deviation(np.stack(given[1][1:-1])))
 
 
-def test_samples_stand_above_true_cars(model: ProbNeRF) -> None:
+def test_samples_stand_above_true_cars(model: ProbNeRF, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grids, "ACROSS", 2)
     rows = sample_rows(model, CARS)
     assert [label for label, _ in rows] == ["prior"] * (DOWN // 2) + ["true"] * (DOWN // 2)
-    assert all(len(shown) == ACROSS for _, shown in rows)
+    assert all(len(shown) == 2 for _, shown in rows)
     assert np.abs(rows[0][1][0] - rows[0][1][1]).max() > 0 and np.abs(rows[-1][1][0] - rows[-1][1][1]).max() > 0
 
 

@@ -115,7 +115,7 @@ def test_out_draws_turning_hypotheses(
     assert calls[0][0] == moving and str(moving) in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("change", "says"), [("stamp", "but object 1 is of"), ("cut", "color.png is cut short")])
+@pytest.mark.parametrize(("change", "says"), [("stamp", "but object 1 is of"), ("cut", "it is cut short at byte 200")])
 def test_a_frame_that_is_not_the_objects_is_left_out(
     results: Path, frame: Frame, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, change: str, says: str
 ) -> None:

@@ -25,10 +25,13 @@ GID = bytes(range(16))
 
 
 def until(condition: Callable[[], object], seconds: float = 20.0) -> bool:
+    """Whether it holds once: a router's answer may lack a node that the one before had."""
     deadline = time.monotonic() + seconds
-    while not condition() and time.monotonic() < deadline:
+    while time.monotonic() < deadline:
+        if condition():
+            return True
         time.sleep(0.02)
-    return bool(condition())
+    return False
 
 
 @pytest.fixture

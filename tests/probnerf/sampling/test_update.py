@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +21,7 @@ from probnerf.types import Posterior, joined
 CONFIG = TemperedSMCConfig(populations=4, particles=64)
 
 
+@eqx.filter_jit
 def _each(args, positions):
     model, likelihood, observation, t = args
     return jax.vmap(lambda q: log_likelihood_one(model, likelihood, observation, t, q))(positions)
