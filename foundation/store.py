@@ -27,6 +27,10 @@ class StoreError(OSError):
     """A file of a store could not be written or read, in one line: the network, rights, or room."""
 
 
+class FullError(StoreError):
+    """A place takes no file, in one line."""
+
+
 class Store:
     """Files by their names (`a/b.json`) under one URL. Raises `ValueError`, one line, for a URL that cannot be."""
 
@@ -57,7 +61,7 @@ class Store:
             raise ValueError(f"{self.url} cannot be written to ({one_line(error)}); give another place") from None
 
     def write(self, name: str, content: bytes) -> None:
-        """Write a file whole or not at all. Raises `StoreError`."""
+        """Write a file whole or not at all. Raises `FullError`."""
         place = self._place(name)
         try:
             if self.local:
@@ -70,7 +74,8 @@ class Store:
                 self._files.pipe_file(part, content)
                 self._files.mv(part, place)
         except Exception as error:  # each backend has its own
-            raise StoreError(f"{self.path(name)} cannot be written ({one_line(error)})") from None
+            line, path = one_line(error), self.path(name)
+            raise FullError(line if path in line else f"{path} cannot be written ({line})") from None
 
     def read(self, names: Iterable[str]) -> dict[str, bytes]:
         """The contents of files that are there. Raises `StoreError`."""

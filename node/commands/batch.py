@@ -21,7 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from foundation.bounded import parse_json
 from foundation.one_line import one_line
-from foundation.store import Store, bytes_of
+from foundation.store import FullError, Store, bytes_of
 from node.commands.batch_logs import find_logs
 from node.commands.batch_options import BatchConfig
 from node.commands.batch_table import TABLE, make_table
@@ -73,6 +73,9 @@ def batch(
         work.report(out, time.monotonic() - begun)
         out.print("interrupted; the same command goes on", highlight=False)
         return INTERRUPTED
+    except FullError as error:  # nothing more can be kept
+        work.report(out, time.monotonic() - begun)
+        raise FullError(f"{error}; then the same command goes on") from None
     work.report(out, time.monotonic() - begun)
     if config.shard is None:
         return _table(store, settings, out)
@@ -238,11 +241,11 @@ def _settings(config: BatchConfig) -> dict[str, Any]:
 
 def _claimed(store: Store, settings: dict[str, Any]) -> str:
     """The digest of these settings, which the place holds from now on. Raises `ValueError` if it holds others."""
-    text = json.dumps(settings, sort_keys=True, default=str, indent=1)
+    text = _written(settings)
     if not store.has(SETTINGS):
         store.write(SETTINGS, text.encode())
     kept = _kept(store)
-    if kept != text:
+    if kept != _written(parse_json(text)):
         before, after = dict(_leaves(parse_json(kept))), dict(_leaves(parse_json(text)))
         name = next(name for name in sorted(before | after) if before.get(name, ...) != after.get(name, ...))
         old, new = (str(values.get(name))[:80] for values in (before, after))
@@ -251,17 +254,23 @@ def _claimed(store: Store, settings: dict[str, Any]) -> str:
 
 
 def _kept(store: Store) -> str:
-    """The settings that the place holds. Raises `ValueError` where they are damaged, or of another version's format."""
+    """The settings that the place holds, as they were written. Raises `ValueError` where they are damaged, or another
+    version's.
+    """
     try:
-        kept = store.read([SETTINGS])[SETTINGS].decode()
-        values = parse_json(kept)
+        values = parse_json(store.read([SETTINGS])[SETTINGS].decode())
         if not isinstance(values, dict):
             raise ValueError("it is no mapping")
     except ValueError as error:
         raise ValueError(f"{store.path(SETTINGS)} is damaged ({one_line(error)[:200]}); give another --out") from None
     if (found := values.get("format")) != FORMAT:
         raise ValueError(f"{store.path(SETTINGS)} has format {str(found)[:40]!r}, not {FORMAT}; give another --out")
-    return kept
+    return _written(values)
+
+
+def _written(settings: dict[str, Any]) -> str:
+    """In one way, whoever wrote them."""
+    return json.dumps(settings, sort_keys=True, default=str, indent=1)
 
 
 def _digest(settings: str) -> str:

@@ -6,8 +6,6 @@ import json
 import math
 import threading
 from dataclasses import dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 from rich.console import Console
@@ -16,7 +14,7 @@ from foundation.one_line import one_line
 from foundation.store import Store, StoreError, bytes_of, local_copy
 from node.commands.batch_task import Job, Record, Task, UnusableError
 from node.commands.frame import read_frame, segments_of
-from perception.answers.hypotheses_file import save
+from perception.answers.hypotheses_file import content_of
 from perception.answers.summary import size
 from perception.inference.controller import estimate
 from perception.inference.schedule import digest
@@ -95,10 +93,7 @@ class Worker:
         h = estimated.hypotheses
         if h.result == StopReason.INTERRUPTED:
             raise KeyboardInterrupt
-        with TemporaryDirectory(prefix="farside-") as folder:
-            path = Path(folder) / "hypotheses.npz"
-            save(path, h)
-            content = path.read_bytes()
+        content = content_of(h)
         self._store.write(f"{task.name}.npz", content)
         return {
             "settings": self._job.settings,

@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
 from foundation.one_line import one_line
-from foundation.store import StoreError
+from foundation.store import FullError, StoreError
 from node.commands.batch_task import TRIES, Event, Job, Record, Task, UnusableError
 from probnerf.environment import prepare
 
@@ -38,7 +38,8 @@ def run_processes(
 ) -> Iterator[Event]:
     """A `Runner` with so many processes, each with a JAX of its own. They are killed when the iteration is left.
 
-    A task whose process dies, or whose place does not answer, is tried three times. Raises `UnusableError`.
+    A task whose process dies, or whose place does not answer, is tried three times. Raises `UnusableError`, and
+    `FullError` where a result finds no place thrice.
     """
     waiting, tries = deque(tasks), Counter[Task]()
     crew = list[_Process]()
@@ -48,8 +49,10 @@ def run_processes(
                 idle.give(waiting.popleft())
             for connection in wait([each.connection for each in crew if each.task]):
                 each = next(each for each in crew if each.connection is connection)
-                task, record, lost = each.take()
+                task, record, lost, full = each.take()
                 tries[task] += 1
+                if full and tries[task] == TRIES:
+                    raise FullError(lost)
                 if not each.process.is_alive() and lost:
                     crew.remove(each)
                 if record is not None:
@@ -92,8 +95,8 @@ class _Process:
         with suppress(OSError):  # it is dead; `take` will say so
             self.connection.send(task)
 
-    def take(self) -> tuple[Task, Record | None, str]:
-        """The task that ended, its record, or how it was lost. Raises `UnusableError`."""
+    def take(self) -> tuple[Task, Record | None, str, bool]:
+        """The task that ended, its record or how it was lost, and if for want of a place. Raises `UnusableError`."""
         task, self.task = self.task, None
         assert task is not None
         try:
@@ -103,10 +106,10 @@ class _Process:
             self.connection.close()
             code = self.process.exitcode or 0
             how = f"was ended by signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"ended with code {code}"
-            return task, None, f"process {self.process.pid} {how}"
+            return task, None, f"process {self.process.pid} {how}", False
         if kind == "unusable":
             raise UnusableError(value)
-        return (task, value, "") if kind == "record" else (task, None, f"process {self.process.pid}: {value}")
+        return (task, value, "", False) if kind == "record" else (task, None, value, kind == "full")
 
 
 def _serve(connection: Connection, job: Job) -> None:
@@ -122,7 +125,7 @@ def _serve(connection: Connection, job: Job) -> None:
         except UnusableError as error:
             answer = "unusable", str(error)
         except StoreError as error:
-            answer = "lost", one_line(error)
+            answer = "full" if isinstance(error, FullError) else "lost", one_line(error)
         try:
             connection.send(answer)
         except OSError:  # the first process was killed; the record is written

@@ -6,6 +6,7 @@ fields of `Hypotheses` and of its ObjectFrame by their own names, and with `diag
 where it is known, `T_world_camera` are the fields of those names. Equal content gives equal bytes.
 """
 
+import io
 import itertools
 import json
 import re
@@ -16,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from foundation.bounded import check_arrays, parse_json
-from foundation.whole_file import whole_file
+from foundation.whole_file import write_whole
 from perception.answers.diagnostics import AnswerDiagnostics
 from perception.answers.hypotheses import Hypotheses
 from perception.observation.object_frame import ObjectFrame
@@ -52,7 +53,20 @@ def frame_path(folder: str | Path) -> Path:
 
 def save(path: str | Path, hypotheses: Hypotheses) -> None:
     """Write the file whole or not at all (a temporary file beside it, then a rename). Raises OSError that names it."""
-    h, path = hypotheses, Path(path)
+    path, content = Path(path), content_of(hypotheses)
+    try:
+        write_whole(path, content)
+    except OSError as error:
+        if error.strerror is None:  # said already
+            raise
+        raise OSError(
+            f"{path} cannot be written ({error.strerror or error}); make room or give another place"
+        ) from None
+
+
+def content_of(hypotheses: Hypotheses) -> bytes:
+    """The file of hypotheses. Equal ones give equal bytes."""
+    h = hypotheses
     header = {
         "format": f"{FORMAT}{VERSION}",
         "stamp_ns": int(h.stamp_ns),
@@ -86,19 +100,14 @@ def save(path: str | Path, hypotheses: Hypotheses) -> None:
     }
     if h.T_world_camera is not None:
         arrays["T_world_camera"] = np.asarray(h.T_world_camera, np.float64)
-    try:
-        # Not np.savez_compressed, whose level of compression takes six times as long for a seventh less. Members opened
-        # by name carry zip's zero date, so that equal content gives equal bytes.
-        with whole_file(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-            for name, array in arrays.items():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                    np.lib.format.write_array(member, array, allow_pickle=False)
-    except OSError as error:
-        if error.strerror is None:  # said already
-            raise
-        raise OSError(
-            f"{path} cannot be written ({error.strerror or error}); make room or give another place"
-        ) from None
+    file = io.BytesIO()
+    # Not np.savez_compressed, whose level of compression takes six times as long for a seventh less. Members opened
+    # by name carry zip's zero date, so that equal content gives equal bytes.
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
+    return file.getvalue()
 
 
 def load(path: str | Path) -> Hypotheses:

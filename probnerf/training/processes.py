@@ -5,7 +5,9 @@ not depend on the number of processes, but for roundings, and can go on with ano
 without the others: if one is lost, all end.
 """
 
+import socket
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
@@ -18,6 +20,7 @@ from jaxtyping import Array, PyTree
 
 from foundation.one_line import one_line
 
+KNOWN_S = 60  # in which the name of process 0's machine must be known
 LOST_S = 60  # without a sign of life, after which a process is lost
 _AGAIN = "start all processes again with the same options: they go on from the last checkpoint"
 _WHOLE, _SPLIT = PartitionSpec(), PartitionSpec("objects")
@@ -28,12 +31,14 @@ T = TypeVar("T", bound=PyTree)
 def joined(coordinator: str, processes: int | None, process: int | None, lost_s: int = LOST_S) -> Iterator[Mesh]:
     """All devices of all processes, on one axis, "objects". To be entered before JAX computes anything.
 
-    `coordinator` is HOST:PORT of process 0, or "auto" under Slurm and Open MPI, which tell all three. Raises
-    ConnectionError, one line, where another process breaks off. Where one does not come within 5 minutes, says nothing
-    for `lost_s` seconds, or was the first one, JAX may abort this process from within, with a trace of its own; a shell
-    that waits beside it then prints the line.
+    `coordinator` is HOST:PORT of process 0, or "auto" under Slurm and Open MPI, which tell all three. Raises ValueError
+    where nothing knows that host, ConnectionError, one line, where another process breaks off. Where one does not come
+    within 5 minutes, says nothing for `lost_s` seconds, or was the first one, JAX may abort this process from within,
+    with a trace of its own; a shell that waits beside it then prints the line.
     """
     where = None if coordinator == "auto" else coordinator
+    if where is not None:
+        _known(where.rpartition(":")[0])
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.config.update("jax_num_cpu_devices", 1)  # of a process; its threads share the work
     line = f"farside: error: this process was aborted, as all are where one does not come or is lost; {_AGAIN}"
@@ -53,6 +58,24 @@ def joined(coordinator: str, processes: int | None, process: int | None, lost_s:
             raise ConnectionError(f"a process is lost, or failed ({one_line(error)[:200]}); {_AGAIN}") from error
         finally:
             watcher.communicate(b"orderly\n")
+
+
+def _known(host: str) -> None:
+    """Wait until the host's name is known: a cluster may learn it when that process has begun. JAX would wait forever.
+
+    Raises ValueError after `KNOWN_S`.
+    """
+    end = time.monotonic() + KNOWN_S
+    while True:
+        try:
+            socket.getaddrinfo(host.strip("[]"), None)
+            return
+        except (OSError, UnicodeError) as error:
+            if time.monotonic() > end:
+                raise ValueError(
+                    f"--coordinator: {host} is no known host ({one_line(error)}); give process 0's"
+                ) from None
+        time.sleep(1.0)
 
 
 def is_first() -> bool:

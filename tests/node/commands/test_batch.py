@@ -2,6 +2,8 @@
 
 import io
 import json
+import re
+import resource
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
-from foundation.store import Store
+from foundation.store import FullError, Store
 from node.__main__ import main
 from node.commands.batch import FAILED, batch
 from node.commands.batch_options import BatchConfig
@@ -190,6 +192,14 @@ def test_settings_that_cannot_be_read_are_named(given: BatchConfig, content: byt
         assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
 
 
+def test_settings_in_another_layout_are_the_same(given: BatchConfig) -> None:
+    run(given)
+    settings = Path(given.out) / "settings.json"
+    settings.write_text(json.dumps(json.loads(settings.read_text()), indent=4) + "\n\n")
+    assert run(given)[0] == FAILED  # of the log that was cut off
+    assert run(BatchConfig(table_only=True, out=given.out))[0] == FAILED
+
+
 def test_other_settings_and_other_logs_do_not_mix_in(given: BatchConfig, logs: Path, tmp_path: Path) -> None:
     log = tmp_path / "my.mcap"
     log.write_bytes((logs / "run.mcap").read_bytes())
@@ -244,6 +254,23 @@ def test_a_task_that_was_lost_thrice_is_given_up(given: BatchConfig) -> None:
     code, text = run(given, losing)
     assert code == FAILED and text.count("process 7 ended; tried again") == 2 * 3 * 2 and "3 failed" in text
     assert {row["error"] for row in table(given)} == {"given up after 3 tries: process 7 ended"}
+
+
+def test_a_place_that_fills_up_ends_the_batch_and_the_command_goes_on(given: BatchConfig) -> None:
+    run(given)
+    next(Path(given.out).rglob("run*/seed_0/object_1.json")).unlink()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2048, hard))  # room for records, not for shapes
+    text = io.StringIO()
+    try:
+        with pytest.raises(FullError) as caught:
+            batch(given, Console(file=text), Console(file=text), here, pretend_estimate)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    line = r".*/out/logs/.*object_1\.npz cannot be written \(File too large\); make room or give another place"
+    assert re.fullmatch(line + "; then the same command goes on", str(caught.value))
+    assert "0 units done" in text.getvalue() and not list(Path(given.out).rglob("object*.failed.json"))
+    assert run(given)[0] == FAILED and len(table(given)) == 5
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """`farside batch` with processes and on a Dask cluster: a worker that dies costs its unit one try, and no result."""
 
 import io
+import resource
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
+from foundation.store import FullError
 from node.__main__ import main
 from node.commands.batch import FAILED, batch
 from node.commands.batch_options import BatchConfig
@@ -63,6 +65,20 @@ def test_a_killed_worker_changes_no_result(given: BatchConfig, deaths: Path, tmp
     assert code == 0 and "4 units done" in text and not list(deaths.iterdir())
     assert "object 2 seed 0: process" in text and "was ended by signal 9 (Killed); tried again" in text
     assert (tmp_path / "two" / "table.parquet").read_bytes() == (tmp_path / "alone" / "table.parquet").read_bytes()
+
+
+@pytest.mark.slow
+def test_a_result_that_finds_no_place_thrice_ends_the_batch(given: BatchConfig) -> None:
+    run(given)
+    next(Path(given.out).rglob("object_2.json")).unlink()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2048, hard))  # the processes inherit it
+    try:
+        with pytest.raises(FullError, match=r"object_\d\.npz cannot be written \(File too large\); make room"):
+            run(given)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert run(given)[0] == 0
 
 
 @pytest.mark.slow

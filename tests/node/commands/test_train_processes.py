@@ -15,6 +15,7 @@ import pytest
 
 from node.commands.training_options import Training
 from probnerf.prior.checkpoint import load_prior
+from probnerf.training import processes
 
 ROOT = Path(__file__).resolve().parents[3]
 SIZES = (
@@ -119,3 +120,10 @@ def test_options_that_do_not_go_together_are_named() -> None:
         Training(coordinator="here", processes=2, process=0)
     with pytest.raises(ValueError, match="--process is 2 of 2; give 0 to 1"):
         Training(coordinator="here:1", processes=2, process=2)
+
+
+def test_a_coordinator_that_nobody_knows_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processes, "KNOWN_S", 0.0)
+    with pytest.raises(ValueError, match=r"^--coordinator: no\.such\.invalid is no known host \("):
+        with processes.joined("no.such.invalid:1234", 2, 1):
+            pass
