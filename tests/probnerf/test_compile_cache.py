@@ -157,7 +157,7 @@ def test_no_folder_or_one_that_cannot_be_made_keeps_nothing(tmp_path: Path, monk
     assert folder() is None  # another's
 
 
-@pytest.mark.usefixtures("optimised")
+@pytest.mark.slow
 def test_the_sampler_answers_bit_for_bit_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model, settings = CylinderModel(), InferConfig(lattice=12)
     drawn, key = likelihood_settings(settings), jax.random.key(0)

@@ -3,11 +3,13 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from benchmarks.rivals.diffusion import Diffusion
 from benchmarks.rivals.recipe import descend, optimiser, rate
 
 
+@pytest.mark.slow
 def test_samples_have_the_learnt_moments():
     """Of two modes of three correlated coordinates, which are standardised."""
 

@@ -72,6 +72,7 @@ def test_a_hidden_handle_is_there_and_unseen(vessel):
     assert vessel.near_handle.sum() > 3 * handle.sum()  # a ring, of which the handle is a part
 
 
+@pytest.mark.slow
 def test_where_the_pose_is_known_the_cube_is_the_object_s_own_and_only_its_shape_is_inferred():
     view = vessels.view("informative", pose_known=True)
     np.testing.assert_allclose(view.T_canonical_view, np.eye(4), atol=1e-9)

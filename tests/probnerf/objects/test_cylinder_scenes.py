@@ -37,7 +37,6 @@ from probnerf.settings import AnnealedHMCConfig
 from probnerf.types import Posterior
 
 CONDITIONS = [(condition, depth) for condition in YAW_OF for depth in (False, True)]
-QUICK = [("hidden", True)]
 
 
 def _each(args, positions):
@@ -140,13 +139,6 @@ def _check(posteriors: list[Posterior], grid: GridPosterior) -> None:
     for posterior in posteriors:
         error = max(0.5, 3.0 * float(posterior.log_evidence_se))
         assert abs(float(posterior.log_evidence) - grid.log_evidence) <= error
-
-
-@pytest.mark.parametrize(("condition", "depth"), QUICK)
-@pytest.mark.usefixtures("optimised")
-def test_tempered_smc_is_the_posterior(condition, depth):
-    args, grid = _scene(condition, depth)
-    _check([tempered_smc(jax.random.key(seed), log_likelihood, args, 9) for seed in (0, 1)], grid)
 
 
 @pytest.mark.slow

@@ -67,7 +67,7 @@ def the_joint_stays(module: ModuleType) -> None:
     assert_zero(q[:, :-1] * q[:, 1:])
 
 
-@pytest.mark.usefixtures("optimised")
+@pytest.mark.slow
 def test_positions_and_pixels_keep_their_joint_law() -> None:
     the_joint_stays(real)
 

@@ -98,7 +98,7 @@ def test_of_two_neighbours_the_better_one_climbs_on() -> None:
     np.testing.assert_allclose(yaw[0], yaw[1], atol=1e-5)
 
 
-@pytest.mark.usefixtures("optimised")
+@pytest.mark.slow
 def test_gaussians_stand_on_modes_as_wide_as_the_posterior_and_the_prior_is_among_them():
     args = scene("seen", True)
     config = ModesConfig(starts=8, climb=AdamConfig(steps=300), prior_share=0.2)

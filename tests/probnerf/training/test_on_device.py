@@ -42,6 +42,7 @@ def test_a_batch_holds_what_its_objects_have_at_their_shares(shapes: ShapeSet):
         np.testing.assert_array_equal(shapes.inside[rows[k], at], batch.inside[k])
 
 
+@pytest.mark.slow
 def test_steps_on_the_device_are_steps_of_the_host(shapes: ShapeSet):
     preset = PRESETS["tiny"]
     likelihood = Likelihood(lattice=foam.Lattice(preset.lattice, 1.0, 9 * preset.lattice // 4))
@@ -84,6 +85,7 @@ def test_occluders_hide_their_share():
     assert not hidden[:5].any() and (hidden & ~np.asarray(seen))[5:].any((1, 2)).all()
 
 
+@pytest.mark.slow
 def test_a_network_learns_from_pictures_on_the_device():
     pictures, _ = toy(256, 1)
     config = PosteriorTrainConfig(steps=120, batch=64, warmup=10, learning_rate=3e-3)
