@@ -68,6 +68,7 @@ def test_a_killed_worker_changes_no_result(given: BatchConfig, deaths: Path, tmp
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("deaths")
 def test_a_result_that_finds_no_place_thrice_ends_the_batch(given: BatchConfig) -> None:
     run(given)
     next(Path(given.out).rglob("object_2.json")).unlink()
