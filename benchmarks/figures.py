@@ -38,7 +38,7 @@ TABLETOP = ROOT / "benchmarks" / "checkpoints" / "tabletop" / "prior.safetensors
 PAPER = ROOT / "benchmarks" / "checkpoints" / "paper"
 PRIORS = {
     None: "The shipped prior",
-    TABLETOP: "The prior before, of tabletop objects alone",
+    TABLETOP: "The tabletop prior, shipped once",
     PAPER / "cars.safetensors": "A prior of cars",
 }
 BEFORE = "3705a6d9783be765+86fc0fe9d866059f"  # in the history alone (benchmarks/checkpoints/README.md)

@@ -27,8 +27,8 @@ class StoreError(OSError):
     """A file of a store could not be written or read, in one line: the network, rights, or room."""
 
 
-class FullError(StoreError):
-    """A place takes no file, in one line."""
+class WriteError(StoreError):
+    """A file could not be written, in one line: rights, room, or the network."""
 
 
 class Store:
@@ -61,7 +61,7 @@ class Store:
             raise ValueError(f"{self.url} cannot be written to ({one_line(error)}); give another place") from None
 
     def write(self, name: str, content: bytes) -> None:
-        """Write a file whole or not at all. Raises `FullError`."""
+        """Write a file whole or not at all. Raises `WriteError`."""
         place = self._place(name)
         try:
             if self.local:
@@ -75,7 +75,7 @@ class Store:
                 self._files.mv(part, place)
         except Exception as error:  # each backend has its own
             line, path = one_line(error), self.path(name)
-            raise FullError(line if path in line else f"{path} cannot be written ({line})") from None
+            raise WriteError(line if path in line else f"{path} cannot be written ({line})") from None
 
     def read(self, names: Iterable[str]) -> dict[str, bytes]:
         """The contents of files that are there. Raises `StoreError`."""

@@ -7,10 +7,12 @@ whether the decoder makes things in space that is certainly free (`ghosts`).
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from jaxtyping import Array, Float
 
 from benchmarks.harness.machine import revision
 from benchmarks.harness.progress import say
@@ -71,6 +73,11 @@ class Options:
     )
 
 
+@eqx.filter_jit  # here, so that it is compiled once for all checkpoints
+def _densities(model: ProbNeRF, z: Float[Array, "b k"], points: Float[Array, "n 3"]) -> Float[Array, "b n"]:
+    return jax.lax.map(lambda one: density_at(model.field, model.hyper(one), None, points), z)
+
+
 def ghosts(model: ProbNeRF, recognition: Recognition, shapes: ShapeSet) -> dict[str, float]:
     """How well recognised objects are made: share of them with more than 1% of their own volume in space that is
     certainly free, the mean of that volume's share, and the share of what is certainly solid that is missing.
@@ -82,11 +89,9 @@ def ghosts(model: ProbNeRF, recognition: Recognition, shapes: ShapeSet) -> dict[
     distance = shapes.distance.astype(np.float32)[:, np.ravel_multi_index(tuple(cell.T), (GRID,) * 3)]
     gap = np.linalg.norm(points - ((cell + 0.5) * (2.0 / GRID) - 1.0), axis=1)
 
-    @jax.jit
-    def solid(z: jax.Array) -> jax.Array:
-        return jax.lax.map(lambda one: density_at(model.field, model.hyper(one), None, jnp.asarray(points)), z)
-
-    made = np.asarray(solid(jnp.asarray(mean))) * (2.0 / VOXELS) > np.log(2.0)  # half of a voxel's light is stopped
+    made = np.asarray(_densities(model, jnp.asarray(mean), jnp.asarray(points))) * (2.0 / VOXELS) > np.log(
+        2.0
+    )  # half of a voxel's light is stopped
     volume = np.maximum((distance < 0.0).sum(axis=1), 1)
     extra = (made & (distance > gap + FREE)).sum(axis=1) / volume
     lost = (~made & (distance < -gap)).sum() / volume.sum()

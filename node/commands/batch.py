@@ -21,7 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from foundation.bounded import parse_json
 from foundation.one_line import one_line
-from foundation.store import FullError, Store, bytes_of
+from foundation.store import Store, WriteError, bytes_of
 from node.commands.batch_logs import find_logs
 from node.commands.batch_options import BatchConfig
 from node.commands.batch_table import TABLE, make_table
@@ -73,9 +73,9 @@ def batch(
         work.report(out, time.monotonic() - begun)
         out.print("interrupted; the same command goes on", highlight=False)
         return INTERRUPTED
-    except FullError as error:  # nothing more can be kept
+    except WriteError as error:  # nothing more can be kept
         work.report(out, time.monotonic() - begun)
-        raise FullError(f"{error}; then the same command goes on") from None
+        raise WriteError(f"{error}; then the same command goes on") from None
     work.report(out, time.monotonic() - begun)
     if config.shard is None:
         return _table(store, settings, out)
@@ -245,7 +245,7 @@ def _claimed(store: Store, settings: dict[str, Any]) -> str:
     if not store.has(SETTINGS):
         store.write(SETTINGS, text.encode())
     kept = _kept(store)
-    if kept != _written(parse_json(text)):
+    if kept != text:
         before, after = dict(_leaves(parse_json(kept))), dict(_leaves(parse_json(text)))
         name = next(name for name in sorted(before | after) if before.get(name, ...) != after.get(name, ...))
         old, new = (str(values.get(name))[:80] for values in (before, after))

@@ -10,7 +10,7 @@ import dask
 from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
 
 from foundation.one_line import one_line
-from foundation.store import FullError, StoreError
+from foundation.store import StoreError, WriteError
 from node.commands.batch_task import TRIES, Event, Job, Record, Task
 from node.commands.batch_workers import worker_of
 
@@ -34,8 +34,8 @@ def run_dask(
     """A `Runner` on the cluster of the scheduler at `address`, or on a `local` one of so many processes.
 
     Dask gives the tasks of a lost worker to others, and gives a task up after three (its `allowed-failures`, of a
-    scheduler that runs already). `say` gets the dashboard's address. Raises `UnusableError`, `FullError` where a result
-    finds no place thrice, and `ValueError` where no scheduler answers.
+    scheduler that runs already). `say` gets the dashboard's address. Raises `UnusableError`, `WriteError` where a
+    result finds no place thrice, and `ValueError` where no scheduler answers.
     """
     with dask.config.set({"distributed.scheduler.allowed-failures": TRIES - 1}), _client(address, workers) as client:
         here, looked = _workers(client), time.monotonic()
@@ -61,7 +61,7 @@ def run_dask(
                 record = future.result()
             except KilledWorker as error:
                 yield Event(task, None, f"worker {error.last_worker.address} died with it", TRIES)
-            except FullError:
+            except WriteError:
                 raise
             except StoreError as error:
                 yield Event(task, None, one_line(error), TRIES)

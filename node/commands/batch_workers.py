@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
 from foundation.one_line import one_line
-from foundation.store import FullError, StoreError
+from foundation.store import StoreError, WriteError
 from node.commands.batch_task import TRIES, Event, Job, Record, Task, UnusableError
 from probnerf.environment import prepare
 
@@ -39,7 +39,7 @@ def run_processes(
     """A `Runner` with so many processes, each with a JAX of its own. They are killed when the iteration is left.
 
     A task whose process dies, or whose place does not answer, is tried three times. Raises `UnusableError`, and
-    `FullError` where a result finds no place thrice.
+    `WriteError` where a result finds no place thrice.
     """
     waiting, tries = deque(tasks), Counter[Task]()
     crew = list[_Process]()
@@ -49,10 +49,10 @@ def run_processes(
                 idle.give(waiting.popleft())
             for connection in wait([each.connection for each in crew if each.task]):
                 each = next(each for each in crew if each.connection is connection)
-                task, record, lost, full = each.take()
+                task, record, lost, unwritten = each.take()
                 tries[task] += 1
-                if full and tries[task] == TRIES:
-                    raise FullError(lost)
+                if unwritten and tries[task] == TRIES:
+                    raise WriteError(lost)
                 if not each.process.is_alive() and lost:
                     crew.remove(each)
                 if record is not None:
@@ -96,7 +96,7 @@ class _Process:
             self.connection.send(task)
 
     def take(self) -> tuple[Task, Record | None, str, bool]:
-        """The task that ended, its record or how it was lost, and if for want of a place. Raises `UnusableError`."""
+        """The task that ended, its record or how it was lost, and if unwritten. Raises `UnusableError`."""
         task, self.task = self.task, None
         assert task is not None
         try:
@@ -109,7 +109,7 @@ class _Process:
             return task, None, f"process {self.process.pid} {how}", False
         if kind == "unusable":
             raise UnusableError(value)
-        return (task, value, "", False) if kind == "record" else (task, None, value, kind == "full")
+        return (task, value, "", False) if kind == "record" else (task, None, value, kind == "unwritten")
 
 
 def _serve(connection: Connection, job: Job) -> None:
@@ -125,7 +125,7 @@ def _serve(connection: Connection, job: Job) -> None:
         except UnusableError as error:
             answer = "unusable", str(error)
         except StoreError as error:
-            answer = "full" if isinstance(error, FullError) else "lost", one_line(error)
+            answer = "unwritten" if isinstance(error, WriteError) else "lost", one_line(error)
         try:
             connection.send(answer)
         except OSError:  # the first process was killed; the record is written

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
-from foundation.store import FullError, Store
+from foundation.store import Store, WriteError
 from node.__main__ import main
 from node.commands.batch import FAILED, batch
 from node.commands.batch_options import BatchConfig
@@ -263,7 +263,7 @@ def test_a_place_that_fills_up_ends_the_batch_and_the_command_goes_on(given: Bat
     resource.setrlimit(resource.RLIMIT_FSIZE, (2048, hard))  # room for records, not for shapes
     text = io.StringIO()
     try:
-        with pytest.raises(FullError) as caught:
+        with pytest.raises(WriteError) as caught:
             batch(given, Console(file=text), Console(file=text), here, pretend_estimate)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
-from foundation.store import FullError
+from foundation.store import WriteError
 from node.__main__ import main
 from node.commands.batch import FAILED, batch
 from node.commands.batch_options import BatchConfig
@@ -75,7 +75,7 @@ def test_a_result_that_finds_no_place_thrice_ends_the_batch(given: BatchConfig) 
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2048, hard))  # the processes inherit it
     try:
-        with pytest.raises(FullError, match=r"object_\d\.npz cannot be written \(File too large\); make room"):
+        with pytest.raises(WriteError, match=r"object_\d\.npz cannot be written \(File too large\); make room"):
             run(given)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
