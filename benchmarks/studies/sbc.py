@@ -21,6 +21,7 @@ outside: how far the ranks' distribution function leaves the band that holds 95%
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +37,7 @@ from benchmarks.harness.tables import Table, gated
 from benchmarks.measures.metrics import coverage, ks_distance, randomised_rank, uniform_band
 from probnerf.fields.base import Model
 from probnerf.fields.cylinder import CylinderModel
-from probnerf.inference import likelihood_of, likelihood_settings
+from probnerf.inference import likelihood_of, likelihood_settings, suited
 from probnerf.likelihood.dispatch import log_likelihood
 from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.likelihood.position import pose_of
@@ -71,10 +72,12 @@ class Condition:
     lattice: int = 12
 
 
+@cache
 def _prior() -> Model:
     return load_prior(None).model
 
 
+@cache
 def _tiny() -> Model:
     return ProbNeRF(PRESETS["tiny"], jax.random.key(0))
 
@@ -99,7 +102,8 @@ CONDITIONS = (
 
 def _settings(condition: Condition) -> InferConfig:
     """Inference's, as a density of pixels: no end to the ranges' reach, and each pixel counted once."""
-    return replace(InferConfig(), reach=1e6, power=1.0, sample_delta=condition.delta, lattice=condition.lattice)
+    config = replace(InferConfig(), reach=1e6, power=1.0, sample_delta=condition.delta, lattice=condition.lattice)
+    return suited(config, condition.model())
 
 
 def statistics(
