@@ -11,6 +11,7 @@ Each frame has its number in its depth. A frame is acknowledged when the recorde
   before the kill, or the recorder had counted them as written two chunks before the disk was full. Must be 0.
 - unanswered: the planner's questions without an answer within 5 s. Must be 0.
 - MB per 1000 frames: slope of the process's resident memory over the last two thirds of the first round.
+- reader_peak: most resident memory of the process that reads the recordings, with all that it imports.
 """
 
 import json
@@ -93,6 +94,8 @@ def main(options: Options) -> Summary:
     rows = [Row("soak", how, "", "rounds", count, "", count) for how, count in ends.items()]
     rows += [Row("soak", "all rounds", "", name, total[name], "", ends.total()) for name in names]
     rows.append(Row("soak", "orderly", "first round", "memory_slope", slope, "MB/1000 frames", 1))
+    peak = 1e-3 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    rows.append(Row("soak", "all rounds", "", "reader_peak", peak, "MB", ends.total()))
     if total["lost"] or total["unanswered"]:
         raise ValueError(f"{total['lost']} recorded frames are lost and {total['unanswered']} questions unanswered")
     return Summary(rows)

@@ -4,12 +4,14 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
@@ -26,6 +28,7 @@ _TYPES = get_typestore(Stores.ROS2_HUMBLE)
 _TRIES = 300  # messages of a topic, as many as a driver sends while it starts
 _MOST_PARTS = 100
 _MAGIC = b"\x89MCAP0\r\n"
+_MOST_MERGED = 1 << 30  # bytes of an MCAP that merging its messages in the order of their times may hold at once
 
 
 @dataclass(frozen=True)
@@ -100,13 +103,19 @@ def open_log(path: Path) -> tuple[Read, dict[str, str], list[str]]:
         except Exception as error:  # whichever parser meets the damage first; the caller's own errors do not pass here
             raise ValueError(f"{path} is damaged ({one_line(error)}); record it again") from None
 
+    def mcaps() -> list[Path]:
+        return [part for part in (_parts(path)[0] if path.is_dir() else [path]) if part.suffix == ".mcap"]
+
     try:
         with AnyReader(parts, default_typestore=_TYPES) as reader:
-            return read, {c.topic: c.msgtype for c in reader.connections if c.msgcount}, notes
+            kinds = {c.topic: c.msgtype for c in reader.connections if c.msgcount}
+        if any(_merged(part) > _MOST_MERGED for part in (path.glob("*.mcap") if path.is_dir() else [path])):
+            notes.append(f"{path.name}: its times of recording do not tell an order; messages are read as they lie")
+            return _open_cut(path, mcaps(), notes)
+        return read, kinds, notes
     except Exception as error:
-        mcaps = [part for part in (_parts(path)[0] if path.is_dir() else [path]) if part.suffix == ".mcap"]
-        if mcaps:
-            return _open_cut(path, mcaps, notes)
+        if cut := mcaps():
+            return _open_cut(path, cut, notes)
         remedy = "give a .mcap, .bag or ROS 2 bag folder"
         if path.suffix == ".zstd":
             remedy = "unpack it with `zstd -d`"
@@ -180,8 +189,26 @@ def _fields(kind: str) -> frozenset[str]:
     return frozenset(name.lower() for name, _ in _TYPES.fielddefs[kind][1]) if kind in _TYPES.fielddefs else frozenset()
 
 
+def _merged(path: Path) -> int:
+    """The most bytes of chunks whose times of recording overlap: all of a file that knows one time only."""
+    summary = None
+    if path.suffix == ".mcap":
+        with path.open("rb") as stream, suppress(McapError):
+            summary = make_reader(stream).get_summary()
+    changes: list[tuple[int, bool, int]] = []
+    for chunk in summary.chunk_indexes if summary else ():
+        changes.append((chunk.message_start_time, False, chunk.uncompressed_size))
+        changes.append((chunk.message_end_time, True, -chunk.uncompressed_size))
+    most = held = 0
+    for _, _, change in sorted(changes):  # at the same time one begins before another ends
+        held += change
+        most = max(most, held)
+    return most
+
+
 def _open_cut(whole: Path, paths: list[Path], notes: list[str]) -> tuple[Read, dict[str, str], list[str]]:
-    """The same for MCAP files that the indexed reader refuses, read from the front for as long as they last."""
+    """The same for MCAP files that the indexed reader refuses, or would hold in memory, read from the front for as long
+    as they last."""
 
     unread: set[str] = set()  # encodings
 

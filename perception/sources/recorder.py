@@ -83,7 +83,7 @@ class Recorder:
             enable_data_crcs=True,
         )
         self._writer.start(profile="ros2", library="farside")
-        self._log_ns = 0  # the latest time in the log
+        self._log_ns, self._set_back_ns = 0, 0  # the latest time in the log, and how far it is ahead of frames' stamps
         self._channels: dict[str, int] = {}  # by topic
         self._schemas: dict[str, int] = {}  # by message type
         self._types: dict[str, str] = {}  # message type of each topic that was handed over
@@ -154,6 +154,7 @@ class Recorder:
                 continue
             try:
                 if isinstance(item, Frame):
+                    self._follow(item.stamp_ns)
                     for message in _messages(item, self.config):
                         self._add(message)
                     self.frames += 1
@@ -175,6 +176,15 @@ class Recorder:
         with suppress(OSError):
             self._stream.close()
 
+    def _follow(self, stamp_ns: int) -> None:
+        """Log times only rise, as players take for granted, and between frames they do so as the stamps do, even where
+        a clock was set back: were they all the same until it has caught up, readers would hold all of it at once."""
+        if stamp_ns >= self._log_ns:
+            self._set_back_ns = 0
+        elif stamp_ns + self._set_back_ns < self._log_ns:
+            self._set_back_ns = self._log_ns - stamp_ns
+        self._log_ns = max(self._log_ns, stamp_ns + self._set_back_ns)
+
     def _add(self, message: _Raw) -> None:
         if message.topic not in self._channels:
             if message.kind not in self._schemas:
@@ -184,7 +194,7 @@ class Recorder:
             metadata = {"offered_qos_profiles": ""}
             channel = self._writer.register_channel(message.topic, "cdr", self._schemas[message.kind], metadata)
             self._channels[message.topic] = channel
-        self._log_ns = max(self._log_ns, message.stamp_ns)  # players take a log's time for one that only rises
+        self._log_ns = max(self._log_ns, message.stamp_ns)
         self._writer.add_message(self._channels[message.topic], self._log_ns, message.data, message.stamp_ns)
 
     def _fail(self, error: Exception) -> None:
