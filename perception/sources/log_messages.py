@@ -7,12 +7,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
-from mcap.records import Channel, Message, Schema
+from mcap.records import Channel, ChunkIndex, Footer, Message, Schema
 from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
@@ -28,6 +27,7 @@ _TYPES = get_typestore(Stores.ROS2_HUMBLE)
 _TRIES = 300  # messages of a topic, as many as a driver sends while it starts
 _MOST_PARTS = 100
 _MAGIC = b"\x89MCAP0\r\n"
+_FOOTER = 37  # bytes of an MCAP from the footer's opcode to the end
 _MOST_MERGED = 1 << 30  # bytes of an MCAP that merging its messages in the order of their times may hold at once
 
 
@@ -109,9 +109,9 @@ def open_log(path: Path) -> tuple[Read, dict[str, str], list[str]]:
     try:
         with AnyReader(parts, default_typestore=_TYPES) as reader:
             kinds = {c.topic: c.msgtype for c in reader.connections if c.msgcount}
-        if any(_merged(part) > _MOST_MERGED for part in (path.glob("*.mcap") if path.is_dir() else [path])):
+        if any(_merged(part) > _MOST_MERGED for part in parts if part.is_file()):
             notes.append(f"{path.name}: its times of recording do not tell an order; messages are read as they lie")
-            return _open_cut(path, mcaps(), notes)
+            return _open_cut(path, parts, notes)
         return read, kinds, notes
     except Exception as error:
         if cut := mcaps():
@@ -190,20 +190,29 @@ def _fields(kind: str) -> frozenset[str]:
 
 
 def _merged(path: Path) -> int:
-    """The most bytes of chunks whose times of recording overlap: all of a file that knows one time only."""
-    summary = None
+    """The most bytes of an MCAP's chunks whose times of recording overlap: all of a file that knows one time only.
+
+    0 where they do not lie in the order of their beginnings: there only merging tells what follows what.
+    """
+    chunks: list[ChunkIndex] = []
     if path.suffix == ".mcap":
-        with path.open("rb") as stream, suppress(McapError):
-            summary = make_reader(stream).get_summary()
-    changes: list[tuple[int, bool, int]] = []
-    for chunk in summary.chunk_indexes if summary else ():
-        changes.append((chunk.message_start_time, False, chunk.uncompressed_size))
-        changes.append((chunk.message_end_time, True, -chunk.uncompressed_size))
+        with suppress(Exception), path.open("rb") as stream:  # whoever reads it will say what is wrong
+            stream.seek(-_FOOTER, os.SEEK_END)
+            footer = next(StreamReader(stream, skip_magic=True).records)
+            if isinstance(footer, Footer) and footer.summary_start:
+                stream.seek(footer.summary_start)
+                records = StreamReader(stream, skip_magic=True, emit_chunks=True).records
+                chunks = [record for record in records if isinstance(record, ChunkIndex)]
+    chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
+    if any(after.message_start_time < chunk.message_start_time for chunk, after in pairwise(chunks)):
+        return 0
+    changes = [(chunk.message_start_time, False, chunk.uncompressed_size) for chunk in chunks]
+    changes += [(chunk.message_end_time, True, -chunk.uncompressed_size) for chunk in chunks]
     most = held = 0
     for _, _, change in sorted(changes):  # at the same time one begins before another ends
         held += change
         most = max(most, held)
-    return most
+    return most if len(chunks) > 1 else 0
 
 
 def _open_cut(whole: Path, paths: list[Path], notes: list[str]) -> tuple[Read, dict[str, str], list[str]]:
@@ -211,6 +220,7 @@ def _open_cut(whole: Path, paths: list[Path], notes: list[str]) -> tuple[Read, d
     as they last."""
 
     unread: set[str] = set()  # encodings
+    ends: dict[Path, str] = {}  # why a file could not be read on
 
     def records(path: Path) -> Iterator[tuple[str, str, Message]]:
         """Topic, type and message of every record of one file that is whole."""
@@ -227,8 +237,8 @@ def _open_cut(whole: Path, paths: list[Path], notes: list[str]) -> tuple[Read, d
                         unread.add(record.message_encoding or "unnamed")
                     elif isinstance(record, Message) and record.channel_id in channels:
                         yield *channels[record.channel_id], record
-            except Exception:  # the file's end, or a record that makes no sense: nothing more is there to read
-                return
+            except Exception as error:  # the file's end, or a record that makes no sense: nothing more can be read
+                ends[path] = one_line(error)
 
     def read(topics: set[str]) -> Iterator[Received]:
         lost = _Lost(whole, notes)
@@ -251,6 +261,8 @@ def _open_cut(whole: Path, paths: list[Path], notes: list[str]) -> tuple[Read, d
             stream.seek(max(size - len(_MAGIC), 0))
             if stream.read() != _MAGIC:
                 notes.append(f"{path.name} is cut short at byte {size}; {count} messages recovered")
+            elif path in ends:
+                notes.append(f"{path.name} is damaged ({ends[path]}); {count} messages before that recovered")
     if not kinds and unread:
         raise ValueError(
             f"{paths[0]}: its messages are {', '.join(sorted(unread))}, which is not read; record the ROS 2 topics"

@@ -32,6 +32,7 @@ _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "C
 _POSE, _STRING = "geometry_msgs/msg/PoseStamped", "std_msgs/msg/String"
 _COLOUR_OUT, _INFO_OUT, _LABEL_OUT = (f"/camera/color/{name}" for name in ("image_raw", "camera_info", "label"))
 _DEPTH_OUT = "/camera/aligned_depth_to_color/image_raw"
+_SECOND, _LAST = 1_000_000_000, 2**63 - 1  # ns
 _COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
 
 
@@ -83,7 +84,8 @@ class Recorder:
             enable_data_crcs=True,
         )
         self._writer.start(profile="ros2", library="farside")
-        self._log_ns, self._set_back_ns = 0, 0  # the latest time in the log, and how far it is ahead of frames' stamps
+        self._log_ns = 0  # the latest time in the log
+        self._stamp_ns = 0  # of the latest frame
         self._channels: dict[str, int] = {}  # by topic
         self._schemas: dict[str, int] = {}  # by message type
         self._types: dict[str, str] = {}  # message type of each topic that was handed over
@@ -179,11 +181,12 @@ class Recorder:
     def _follow(self, stamp_ns: int) -> None:
         """Log times only rise, as players take for granted, and between frames they do so as the stamps do, even where
         a clock was set back: were they all the same until it has caught up, readers would hold all of it at once."""
-        if stamp_ns >= self._log_ns:
-            self._set_back_ns = 0
-        elif stamp_ns + self._set_back_ns < self._log_ns:
-            self._set_back_ns = self._log_ns - stamp_ns
-        self._log_ns = max(self._log_ns, stamp_ns + self._set_back_ns)
+        rise = min(max(stamp_ns - self._stamp_ns, 0), _SECOND)
+        self._stamp_ns = stamp_ns
+        if self._log_ns - stamp_ns > _SECOND:
+            self._log_ns = min(self._log_ns + rise, _LAST)
+        else:  # frames that overtake each other, or come after a message of a later stamp
+            self._log_ns = max(self._log_ns, stamp_ns)
 
     def _add(self, message: _Raw) -> None:
         if message.topic not in self._channels:
@@ -194,7 +197,7 @@ class Recorder:
             metadata = {"offered_qos_profiles": ""}
             channel = self._writer.register_channel(message.topic, "cdr", self._schemas[message.kind], metadata)
             self._channels[message.topic] = channel
-        self._log_ns = max(self._log_ns, message.stamp_ns)
+        self._log_ns = min(max(self._log_ns, message.stamp_ns), _LAST)
         self._writer.add_message(self._channels[message.topic], self._log_ns, message.data, message.stamp_ns)
 
     def _fail(self, error: Exception) -> None:

@@ -16,13 +16,11 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
-from perception.sources import log_messages
 from perception.sources.frame import Frame
 from perception.sources.recorder import Recorder, write_log
 from perception.sources.recording import Log
@@ -264,37 +262,6 @@ def test_a_full_disk_ends_the_recording_alone(tmp_path: Path) -> None:
         fails(tmp_path / "a.mcap", os.strerror(28))  # ENOSPC
     finally:
         subprocess.run(["umount", tmp_path], check=True)
-
-
-def test_log_times_rise_where_the_cameras_clock_jumps_back(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    written = [replace(frame(i), stamp_ns=START + 33_000_000 * i - 10_000_000_000 * (i > 2)) for i in range(6)]
-    record(path, written)
-    with path.open("rb") as stream:
-        times = [message.log_time for _, _, message in make_reader(stream).iter_messages(log_time_order=False)]
-    rise = np.diff(times)[np.diff(times) != 0]  # messages of a frame share a time
-    np.testing.assert_array_equal(rise, [33_000_000] * 2 + [33_000_000] * 2)
-    log = Log(path)
-    for read, was in zip(log, written, strict=True):
-        same(read, was)
-    assert "stamps jump back by 9.97 s" in log.notes[-1]
-
-
-def test_a_recording_that_knows_one_time_only_is_not_read_all_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As of converters that leave log times empty, and of this recorder once, whose clock had been set back."""
-    path, written = tmp_path / "a.mcap", [frame(i) for i in range(6)]
-    monkeypatch.setattr(Recorder, "_follow", lambda self, stamp_ns: None)
-    add = Writer.add_message
-    monkeypatch.setattr(Writer, "add_message", lambda self, channel, at, *rest: add(self, channel, START, *rest))
-    record(path, written, RecordConfig(chunk_bytes=20_000))
-    assert not Log(path).notes  # it is small
-    monkeypatch.setattr(log_messages, "_MOST_MERGED", 40_000)
-    log = Log(path)
-    assert log.notes == ["a.mcap: its times of recording do not tell an order; messages are read as they lie"]
-    for read, was in zip(log, written, strict=True):
-        same(read, was)
 
 
 def test_a_name_that_no_message_holds_is_no_matter_of_room(tmp_path: Path) -> None:
