@@ -1,4 +1,4 @@
-"""Log times rise whatever the camera's clock does, and a recording whose times tell nothing is read in little memory."""
+"""Log times rise whatever the camera's clock does; a recording whose times tell nothing is read in little memory."""
 
 from dataclasses import replace
 from pathlib import Path
