@@ -66,6 +66,7 @@ def test_steps_follow_the_clock_and_a_loss_that_is_not_finite_ends_it(tmp_path: 
         list(by_the_clock(lambda s: (s, {"loss": jnp.array([jnp.nan])}), state, 9, clock, 1e6, tmp_path / "n.jsonl"))
 
 
+@pytest.mark.slow
 def test_a_job_leaves_shapes_pictures_and_objects_and_is_not_repeated(tmp_path: Path) -> None:
     made = make(Job("household", None, 0, 2), tmp_path)
     assert isinstance(made, Made) and 1 <= made.count <= 2

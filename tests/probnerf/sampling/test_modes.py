@@ -72,6 +72,7 @@ def _starts(count: int):
     return jnp.zeros((count, 9)).at[:, 2].set(jnp.cos(yaw)).at[:, 3].set(jnp.sin(yaw))
 
 
+@pytest.mark.slow
 def test_the_stiffness_is_the_hessian_s_without_its_rising_directions():
     args = scene("seen", True)
     q = jnp.array([[0.3, 0.1, 0.6, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0, -0.2, -1.0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0]])
@@ -86,6 +87,7 @@ def test_the_stiffness_is_the_hessian_s_without_its_rising_directions():
     assert float(along.max()) > 100.0 and float(along.min()) == 0.0
 
 
+@pytest.mark.slow
 def test_of_two_neighbours_the_better_one_climbs_on() -> None:
     args = scene("seen", True)
     still = AdamConfig(steps=1, learning_rate=1e-9, final_learning_rate=1e-9)
@@ -160,6 +162,7 @@ def _tiny():
     return model, picture, scene("hidden", True)[2]
 
 
+@pytest.mark.slow
 def test_the_modes_of_a_view_are_sought_where_the_encoder_says():
     model, picture, observation = _tiny()
     config = InferConfig(lattice=8, modes=ModesConfig(starts=6, screen=AdamConfig(steps=2), climb=AdamConfig(steps=2)))
