@@ -5,13 +5,14 @@ PYTHON ?= $(shell for p in python3.11 python3 python3.12 python3.13 python3.14; 
 BIN := .venv/bin
 ARGS ?=
 
-.PHONY: help setup run test slow smoke docs format lock clean
+.PHONY: help setup run test slow nightly smoke docs format lock clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo 'make run     set up if needed, then replay the recording that ships with the project (ARGS=... adds options)'
 	@echo 'make test    set up if needed, then lint, format check, types and the default tests'
 	@echo 'make slow    the statistical tests of minutes'
+	@echo 'make nightly more of them, of the rivals and of the tests themselves'
 	@echo 'make smoke   build the wheel, install it into an empty environment, and use it there'
 	@echo 'make docs    build the documentation into site/'
 	@echo 'make format  sort imports and format every file'
@@ -31,6 +32,9 @@ test: setup
 # pytest answers 5 where no test is marked slow.
 slow: setup
 	$(BIN)/pytest -m slow -n 2 --dist loadfile $(ARGS) || [ $$? -eq 5 ]
+
+nightly: setup
+	$(BIN)/pytest -m nightly -n 2 --dist loadfile $(ARGS)
 
 smoke: setup
 	.ci/smoke

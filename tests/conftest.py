@@ -30,7 +30,7 @@ farside.prepare = lambda: None  # what it sets would reach all tests of this pro
 
 def pytest_configure(config: pytest.Config) -> None:
     """The default tests compile more than they compute: they optimise little. Slow ones run the code that users run."""
-    if config.option.markexpr == "not slow":
+    if config.option.markexpr == "not slow and not nightly":
         quick = (
             "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1 "
             "--xla_cpu_parallel_codegen_split_count=1"  # small programs: to split one takes longer than to compile it

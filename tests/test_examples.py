@@ -74,7 +74,6 @@ def test_reach_planner_takes_a_way_that_is_free_enough_and_no_doubtful_one(
             assert "taken: from" in capsys.readouterr().out
 
 
-@pytest.mark.slow
 def test_ompl_plans_against_each_thing_that_planners_get(
     example: Callable, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

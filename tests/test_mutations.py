@@ -1,6 +1,6 @@
 """Edits that default tests once let pass: each is made in a copy of the checkout, where its test must fail.
 
-    .venv/bin/pytest -m slow tests/test_mutations.py
+    .venv/bin/pytest -m nightly tests/test_mutations.py
 
 An edit whose source has moved on fails here, too, and wants its text renewed.
 """
@@ -133,7 +133,7 @@ def outcome(folder: Path, test: str) -> tuple[int, str]:
     return ended.returncode, ended.stdout + ended.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_an_edit_that_was_overlooked_is_seen(name: str, copy: Path) -> None:
     edit = MUTATIONS[name]
@@ -149,7 +149,7 @@ def test_an_edit_that_was_overlooked_is_seen(name: str, copy: Path) -> None:
     assert "\nFAILED " in said, said  # not an error outside the test
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_without_an_edit_the_same_tests_pass(copy: Path) -> None:
     for test in sorted({edit.test for edit in MUTATIONS.values()}):
         status, said = outcome(copy, test)

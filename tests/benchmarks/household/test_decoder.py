@@ -74,7 +74,7 @@ def test_all_is_extra_where_nothing_is_and_nothing_where_all_is_solid(shapes: Sh
     assert (empty["extra"] > 0.0) == (made > 0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_run_leaves_a_prior_and_goes_on_from_where_it_ended(shapes: ShapeSet, tmp_path: Path) -> None:
     path = tmp_path / "prior.safetensors"
     save_prior(path, MODEL, {}, half=True)

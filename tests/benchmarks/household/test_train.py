@@ -66,7 +66,7 @@ def test_steps_follow_the_clock_and_a_loss_that_is_not_finite_ends_it(tmp_path: 
         list(by_the_clock(lambda s: (s, {"loss": jnp.array([jnp.nan])}), state, 9, clock, 1e6, tmp_path / "n.jsonl"))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_job_leaves_shapes_pictures_and_objects_and_is_not_repeated(tmp_path: Path) -> None:
     made = make(Job("household", None, 0, 2), tmp_path)
     assert isinstance(made, Made) and 1 <= made.count <= 2
@@ -83,7 +83,7 @@ def test_a_job_leaves_shapes_pictures_and_objects_and_is_not_repeated(tmp_path: 
     assert isinstance(nothing, str) and "FileNotFound" in nothing
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_objects_read_back(tmp_path: Path) -> None:
     for job in (Job("household", None, 4, 1), Job("tabletop", None, 0, 8)):
         made = make(job, tmp_path)
@@ -104,7 +104,7 @@ def recognition_input(shapes: ShapeSet, thing: LearntObject) -> np.ndarray:
     return np.asarray(batch.description[0])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_network_learns_objects_and_the_models_own_shapes_until_its_time_is_over(tmp_path: Path) -> None:
     weights, work = tmp_path / "prior.safetensors", tmp_path / "work"
     work.mkdir()

@@ -96,7 +96,7 @@ def test_acceptance_is_of_a_draw_with_delta(run: Run, monkeypatch: pytest.Monkey
     assert renderers.by_step(run.results.lines, "foam")[0.0005] == [0.75]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_decoders_are_timed_in_one_run(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     seconds = {"ProbNeRF": 0.1, "NeRF-VAE, own sizes": 0.4, "Functa, own sizes": 2.0}
     shown: list[str] = []

@@ -102,7 +102,7 @@ def test_srn_folders_read_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(about, views.T_object_camera[0], atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_folder_of_a_family_is_completed_and_trains(tmp_path: Path) -> None:
     """The command of the paper's own experiment, on a small folder in the layout of SRN Cars."""
     options = Options(tmp_path / "cars_train", count=2, views=3, size=32)

@@ -30,7 +30,7 @@ def test_a_map_is_the_deviation_between_draws() -> None:
     assert np.count_nonzero(found) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_rows_are_truth_draws_and_map(model: ProbNeRF, monkeypatch: pytest.MonkeyPatch, draws: int = 3) -> None:
     monkeypatch.setattr(grids, "DRAWS", draws)
     monkeypatch.setattr(grids, "CHAINS", draws)

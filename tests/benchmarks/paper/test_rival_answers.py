@@ -58,7 +58,7 @@ def test_those_without_weights_are_left_out_and_the_table_says_so(folder: Path, 
     assert "left out" in lines["pixelNeRF"][7] and lines["NeRF-VAE"][2:5] == ["3", "2", "8"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("which", [0, 1])
 def test_answers_are_pictures_and_only_draws_differ(
     folder: Path, view: Conditioned, tmp_path: Path, which: int

@@ -9,7 +9,7 @@ from benchmarks.rivals.diffusion import Diffusion
 from benchmarks.rivals.recipe import descend, optimiser, rate
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_samples_have_the_learnt_moments():
     """Of two modes of three correlated coordinates, which are standardised."""
 

@@ -29,7 +29,7 @@ def test_labels_are_of_the_car_and_the_view(cars: PictureSet) -> None:
     np.testing.assert_array_equal(numbers[:, 0, 3:], numbers[:, 1, 3:])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_it_learns_and_its_file_gives_the_same_features(cars: PictureSet, tmp_path: Path) -> None:
     style, numbers = labels(cars)
     losses, figures = [], {}

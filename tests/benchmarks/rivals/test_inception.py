@@ -179,7 +179,7 @@ def test_weights_are_read_and_what_is_wrong_with_them_is_said(suffix: str, tmp_p
         load_inception(tmp_path / f"none{suffix}")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_whole_pictures_have_features(optimised: None) -> None:
     weights = {name: jax.numpy.asarray(a) for name, a in random_arrays().items()}
     rgb = np.random.default_rng(6).uniform(0.0, 1.0, (3, 64, 64, 3)).astype(np.float32)

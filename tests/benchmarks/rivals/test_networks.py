@@ -55,7 +55,7 @@ def test_features_are_those_of_a_pixel_at_its_centre_and_means_between(pictures)
     np.testing.assert_allclose(between, [picture[2, 2:4].mean(axis=0), picture[0, 0], picture[7, 7]], atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_encoder_ignores_unused_pictures_and_their_order(pictures):
     model = NeRFVAE(tiny("nerf_vae"), jax.random.key(0))
     rgb, T = pictures.rgb[0], pictures.T_object_camera[0]
@@ -67,7 +67,7 @@ def test_an_encoder_ignores_unused_pictures_and_their_order(pictures):
     assert not np.allclose(answer, fewer, atol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_discriminator_does_not_see_detail_before_it_fades_in(pictures):
     judge = Discriminator(8, 2, (8, 8, 16), jax.random.key(0))
     rgb = jnp.moveaxis(pictures.rgb[0] / 127.5 - 1.0, 3, 1)
@@ -81,7 +81,7 @@ def test_a_discriminator_does_not_see_detail_before_it_fades_in(pictures):
     assert not np.allclose(judge(rgb, T[::-1], jnp.asarray(1.0)), after[0], atol=1e-3)  # it is told the camera
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", ["pixel_nerf", "nerf_vae", "pi_gan"])
 def test_everything_learns_and_a_file_gives_it_back(name, pictures, tmp_path: Path):
     config = tiny(name)

@@ -46,7 +46,7 @@ def functa(balls):
     return pictures, config, entry
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_field_learns_to_fit_objects_in_three_steps(balls):
     pictures, config, entry = functa(balls)
     recipe = entry.recipe(config)
@@ -84,7 +84,7 @@ def test_rays_pass_through_pixel_centres():
         np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_run_ends_in_time_and_its_file_is_a_rival(balls, tmp_path):
     balls.save(tmp_path / "balls.npz")
     options = Options("functa", tmp_path / "balls.npz", tmp_path / "out", seconds=60.0, sizes="tiny")

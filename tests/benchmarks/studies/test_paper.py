@@ -102,7 +102,6 @@ def test_pictures_are_of_each_camera(view: Conditioned, model: ProbNeRF) -> None
     assert shapes(model, likelihood, jnp.zeros((1, model.latent))).shape == (1, 32, 32, 32)
 
 
-@pytest.mark.slow
 def test_delta_adds_the_field_s_weights_and_one_temperature_is_one(view: Conditioned, model: ProbNeRF) -> None:
     question = Question(view, model, SHORT, 0)
     dims = {m.name: m.answer(question).posterior.positions.shape[1] for m in (HMC, HMC_DELTA, VI_DELTA)}

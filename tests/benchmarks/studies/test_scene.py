@@ -7,7 +7,6 @@ from benchmarks.scenes.crowded import crowd, hidden_points
 from benchmarks.studies.scene import Options, summary
 
 
-@pytest.mark.slow
 def test_points_of_a_crowd_are_hidden_and_its_solids_do_not_meet() -> None:
     made = crowd(3, count=3)
     again = crowd(3, count=3)

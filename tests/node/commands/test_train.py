@@ -107,7 +107,6 @@ def test_training_goes_on_from_weights_of_the_same_preset(
     assert "holds preset 'tiny', not 'small'" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_pictures_of_ones_own_take_the_place_of_procedural_objects(
     tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture
 ) -> None:
@@ -133,7 +132,6 @@ def test_pictures_of_ones_own_take_the_place_of_procedural_objects(
     assert "--pictures is 0; give 1 or more" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_ctrl_c_leaves_the_curves(tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture) -> None:
     trainer.error = KeyboardInterrupt()
     assert run(tmp_path) == 130

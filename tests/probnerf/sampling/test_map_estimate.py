@@ -85,7 +85,6 @@ def test_the_yaw_s_prior_is_flat():
     np.testing.assert_allclose(a, b, atol=1e-2)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("optimised")
 def test_a_visible_handle_s_yaw_and_the_body_s_size_are_found_again():
     yaw = 1.0

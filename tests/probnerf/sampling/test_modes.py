@@ -72,7 +72,6 @@ def _starts(count: int):
     return jnp.zeros((count, 9)).at[:, 2].set(jnp.cos(yaw)).at[:, 3].set(jnp.sin(yaw))
 
 
-@pytest.mark.slow
 def test_the_stiffness_is_the_hessian_s_without_its_rising_directions():
     args = scene("seen", True)
     q = jnp.array([[0.3, 0.1, 0.6, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0, -0.2, -1.0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0]])
@@ -87,7 +86,6 @@ def test_the_stiffness_is_the_hessian_s_without_its_rising_directions():
     assert float(along.max()) > 100.0 and float(along.min()) == 0.0
 
 
-@pytest.mark.slow
 def test_of_two_neighbours_the_better_one_climbs_on() -> None:
     args = scene("seen", True)
     still = AdamConfig(steps=1, learning_rate=1e-9, final_learning_rate=1e-9)
@@ -162,7 +160,6 @@ def _tiny():
     return model, picture, scene("hidden", True)[2]
 
 
-@pytest.mark.slow
 def test_the_modes_of_a_view_are_sought_where_the_encoder_says():
     model, picture, observation = _tiny()
     config = InferConfig(lattice=8, modes=ModesConfig(starts=6, screen=AdamConfig(steps=2), climb=AdamConfig(steps=2)))
