@@ -203,7 +203,7 @@ def main(options: Options) -> Path:
     config = entry.config(box=box, tan_half_fov=float(learnt.tan_half_fov), **sizes_of(entry, options.sizes, size))
     recipe = entry.recipe(config)
     k0, *keys = jax.random.split(jax.random.key(options.seed), 1 + len(recipe.phases))
-    state = recipe.start(k0)  # not compiled: to compile so many draws takes minutes
+    state = recipe.start(k0)  # not compiled: that takes longer than to draw once
     with ThreadPoolExecutor(1) as pool:
         programs = compiled(recipe.phases, state, pictures, pool)
         programs[0].result()

@@ -1,9 +1,9 @@
 """What changed between two revisions: a study's kept rows beside those of before, object by object.
 
-Rows are paired where condition, method, object and seed are the same; an object's seeds count as one. Each file is read
-for one prior, that of its last row. A difference is after less before, with its 95% interval (Student's t over
-objects). Only numbers that both have are compared: scores, counts and seconds alike; lower is not always better, and
-machines round differently.
+Rows are paired where condition, method, object and seed are the same; an object's seeds count as one. Of each file the
+rows of one prior are read, that of its last row unless another is named, with each method's newest settings. A
+difference is after less before, with its 95% interval (Student's t over objects). Only numbers that both have are
+compared: scores, counts and seconds alike; lower is not always better, and machines round differently.
 """
 
 import subprocess
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.harness.intervals import gap_rows, paired_interval
-from benchmarks.harness.results import FOLDER, KEY, Line, key, read_lines
+from benchmarks.harness.results import FOLDER, KEY, Line, newest, read_lines
 from benchmarks.harness.rows import Row
 from benchmarks.harness.study import StudyOptions, Summary
 from benchmarks.harness.tables import Table, ranged
@@ -80,9 +80,9 @@ def _older(options: Options, path: Path) -> list[Line]:
 
 
 def of_prior(lines: Sequence[Line], prior: str) -> list[Line]:
-    """Rows of the prior whose identity begins so, or of the last row's; of what was made twice the last one."""
-    wanted = prior or (str(lines[-1]["prior"]).partition("+")[0] if lines else "")
-    return list({key(line): line for line in lines if str(line["prior"]).startswith(wanted)}.values())
+    """The newest rows of the last prior in the file whose identity begins so."""
+    named = [str(line["prior"]) for line in lines if str(line["prior"]).startswith(prior)]
+    return newest(lines, named[-1]) if named else []
 
 
 def differences(before: Iterable[Line], after: Iterable[Line], columns: Sequence[str] = ()) -> dict[_Group, _Pairs]:
@@ -100,12 +100,11 @@ def differences(before: Iterable[Line], after: Iterable[Line], columns: Sequence
 
 
 def _values(lines: Iterable[Line], columns: Sequence[str]) -> dict[_Group, dict[tuple[str, int], float]]:
-    """Numbers by group, and by object and seed."""
+    """Numbers by group, and by object and seed; of yes and no, 1 and 0."""
     found: dict[_Group, dict[tuple[str, int], float]] = defaultdict(dict)
     for line in lines:
         for column, value in line.items():
-            number = isinstance(value, bool | int | float)  # of yes and no: shares of yes
-            if number and column not in KEY and (not columns or column in columns):
+            if isinstance(value, int | float) and column not in KEY and (not columns or column in columns):
                 group = (str(line["condition"]), str(line["method"]), column)
                 found[group][str(line["object"]), line["seed"]] = float(value)
     return found

@@ -12,12 +12,12 @@ of the shape on 24^3 voxels:
 - log_likelihood: of the pixels.
 
 `cylinder` is an analytic field. The tiny field is a ProbNeRF with the weights that training begins with: shapes like
-clouds, and few enough weights for 200 draws with delta. With eight times the particles, what is left of an error is not
-of their number: yaw, which holds the truth too seldom otherwise, holds it. The quick sampler is the shipped one, but
-all of its particles start from the prior, because no picture is drawn for the encoder, and it makes one run.
+clouds, and few enough weights for 200 draws with delta; `eight times the particles` are the first of the same draws,
+and tell which errors are of too few. The quick sampler is the shipped one, but all of its particles start from the
+prior, because no picture is drawn for the encoder, and it makes one run.
 
-The rows of `shipped prior` are of the prior that the page names, the tabletop one, and fail. Of the one that is shipped
-now a draw takes half a minute, and no set of draws is kept: whether the sampler returns its posterior is not known.
+The rows of `shipped prior` are of the prior that the page names, the tabletop one, and fail. None are kept of the one
+that is shipped now: whether the sampler returns its posterior is not known.
 
 outside: how far the ranks' distribution function leaves the band that holds 95% of uniform samples as a whole
 (`metrics.uniform_band`); 0 if it stays inside. coverage90: share of truths in the central 90%.

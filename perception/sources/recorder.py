@@ -179,8 +179,9 @@ class Recorder:
             self._stream.close()
 
     def _follow(self, stamp_ns: int) -> None:
-        """Log times only rise, as players take for granted, and between frames they do so as the stamps do, even where
-        a clock was set back: were they all the same until it has caught up, readers would hold all of it at once."""
+        """Log times only rise, as players take for granted, and after a clock was set back they do so as the stamps do,
+        by a second a frame at most: were they all the same until it catches up, readers would hold all of it at once.
+        """
         rise = min(max(stamp_ns - self._stamp_ns, 0), _SECOND)
         self._stamp_ns = stamp_ns
         if self._log_ns - stamp_ns > _SECOND:

@@ -15,6 +15,12 @@ from perception.sources.settings import RecordConfig
 from tests.perception.sources.test_recorder import START, frame, record, same
 
 
+def log_times(path: Path) -> list[int]:
+    with path.open("rb") as stream:
+        times = [message.log_time for _, _, message in make_reader(stream).iter_messages(log_time_order=False)]
+    return list(dict.fromkeys(times))  # messages of a frame share a time
+
+
 def test_log_times_rise_where_the_cameras_clock_jumps_back(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     written = [replace(frame(i), stamp_ns=START + 33_000_000 * i - 10_000_000_000 * (i > 2)) for i in range(6)]
@@ -25,12 +31,6 @@ def test_log_times_rise_where_the_cameras_clock_jumps_back(tmp_path: Path) -> No
     for read, was in zip(log, written, strict=True):
         same(read, was)
     assert "stamps jump back by 9.97 s" in log.notes[-1]
-
-
-def log_times(path: Path) -> list[int]:
-    with path.open("rb") as stream:
-        times = [message.log_time for _, _, message in make_reader(stream).iter_messages(log_time_order=False)]
-    return list(dict.fromkeys(times))  # messages of a frame share a time
 
 
 def test_a_clock_that_jumps_to_and_fro_carries_log_times_nowhere(tmp_path: Path) -> None:
