@@ -31,7 +31,7 @@ test: setup
 
 # pytest answers 5 where no test is marked slow.
 slow: setup
-	$(BIN)/pytest -m slow -n 2 --dist loadfile $(ARGS) || [ $$? -eq 5 ]
+	$(BIN)/pytest -m slow -n 2 --dist loadfile --durations=25 $(ARGS) || [ $$? -eq 5 ]
 
 nightly: setup
 	$(BIN)/pytest -m nightly -n 2 --dist loadfile $(ARGS)
