@@ -46,15 +46,14 @@ pictures: `python -m benchmarks.paper.grids` draws those at the end, uncurated, 
 from behind, annealed and at one temperature, and answers to a car from behind: the truth, 8 draws (of the ambulance,
 the chains' last states), and the deviation of each pixel between them (black 0, white 0.25), of the given view and of
 the hidden side. Samples: the prior's above, true cars below. Looked at: hidden sides of hmc's answers differ more than
-given ones; at one temperature most of the ambulance's chains end at other vehicles, with the tuned step, too (it has
-no rows yet).
+given ones; at one temperature most of the ambulance's chains end at other vehicles, with the tuned step, too.
 
 The first table has the paper's claims with a verdict each, computed from these rows (`benchmarks.paper.claims`).
 
 HMC is shortened to 40 x 25 and VI to 600 steps for two cores; `--full` runs the paper's own schedule. `--small` trains
 nothing, answers the first four objects anew, shows the tables of the committed rows, and how far the two differ. Ended
-or killed, it goes on where it was. Its parts, measured with one object each, add up to an hour of processor time at
-most, which the samplers spread over two cores; it has not been run whole. `--full` is about 18 hours, so counted.
+or killed, it goes on where it was. On two slow cores that also did other work it had made all but the last renderer and
+the sweep after 62 minutes; the whole was not timed. `--full` is about 18 hours, so counted.
 """
 
 from collections.abc import Sequence
