@@ -30,7 +30,7 @@ ORDER = {
     "What it is worth to a planner": ("reach", "query", "next_view"),
     "Faults": ("stability",),
     "The camera": ("intrinsics",),
-    "Speed": ("kernel", "frontier", "effort", "startup"),
+    "Speed": ("kernel", "frontier", "effort", "runs", "startup"),
     "The node": ("ingest", "bus", "record", "soak"),
     "Many logs": ("batch",),
 }

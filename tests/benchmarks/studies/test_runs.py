@@ -1,0 +1,36 @@
+"""Further runs: what a file of rows is summed up to."""
+
+import numpy as np
+import pytest
+
+from benchmarks.harness.intervals import Figures
+from benchmarks.scenes.strangers import GSO
+from benchmarks.studies.runs import COUNTS, Options, method_of, summary
+
+
+def lines(name: str, seed: int, scores: tuple[float, ...], losses: tuple[float, ...], explained: float) -> list[dict]:
+    same = {"prior": "p", "settings": {}, "revision": "r", "machine": "m", "condition": GSO, "object": name}
+    told = zip(COUNTS, scores, losses, strict=False)
+    return [
+        {**same, "seed": seed, "method": method_of(number), "balanced": score, "expected_loss": loss,
+         "explained": explained, "seconds": 5.0 * number}
+        for number, score, loss in told
+    ]  # fmt: skip
+
+
+def test_runs_are_paired_with_the_first_and_the_rule_is_followed() -> None:
+    rows = lines("a", 0, (0.5, 0.4, 0.4, 0.4), (0.004,) * 4, 0.95)  # one run suffices
+    rows += lines("a", 1, (0.3, 0.4, 0.4, 0.2), (0.008, 0.006, 0.004, 0.003), 0.95)  # two wanted, and then a third
+    rows += lines("b", 0, (0.6, 0.6, 0.6, 0.6), (0.001,) * 4, 0.8)  # too little is explained: all
+    rows += lines("cut", 0, (0.9,), (0.001,), 0.95)
+    rows.append(
+        {k: v for k, v in rows[0].items() if k not in ("balanced", "seconds")} | {"object": "c", "refused": "x"}
+    )
+    found = summary(rows, Options())
+    of = Figures(found.rows)
+    assert of(GSO, "1 run", "balanced") == pytest.approx(0.5) and of.count(GSO, "1 run", "balanced") == 2
+    assert of(GSO, "4 runs", "above_one") == pytest.approx((0.3 - 0.4) / 2)
+    assert of(GSO, "1 run", "spread") == pytest.approx(0.2) and of(GSO, "2 runs", "spread") == pytest.approx(0.0)
+    np.testing.assert_allclose([of(GSO, method_of(n), "rule") for n in COUNTS], [1 / 3, 0, 1 / 3, 1 / 3])
+    assert of(GSO, "3 runs", "seconds") == pytest.approx(15.0)
+    assert len(found.tables[0].lines) == 4 and found.picture().axes and summary([], Options()) is None
