@@ -52,7 +52,7 @@ The first table has the paper's claims with a verdict each, computed from these 
 
 HMC is shortened to 40 x 25 and VI to 600 steps for two cores; `--full` runs the paper's own schedule. `--small` trains
 nothing, answers the first four objects anew, shows the tables of the committed rows, and how far the two differ. Ended
-or killed, it goes on where it was. On two slow cores that also did other work it took about 80 minutes, in two parts and
+or killed, it goes on where it was. On two slow cores that also did other work it took 84 minutes, in two parts and
 without the decoders' cost; how long it takes alone was not measured. `--full` is about 18 hours, so counted.
 """
 
