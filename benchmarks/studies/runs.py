@@ -8,12 +8,12 @@ and scored. A run begins anew; the answer is of all runs together, and has 48 sh
 - spread: the larger seed's score less the smaller one's, mean over objects with both.
 - expected_loss: what the answer itself expects to lose by few populations (`publish.expected_loss`), nats a voxel.
 - rule: share of the answers at which the controller would stop (`perception.inference.run_plan`).
-- seconds: until the answer, a mean.
+- seconds: until the answer, a mean, with the answers published after the runs before, and what had to be compiled.
 """
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,9 +23,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from tyro.conf import arg
 
-from benchmarks.harness.intervals import Figures, gap_rows, mean_rows
+from benchmarks.harness.intervals import Figures, gap_rows, interval, mean_rows
 from benchmarks.harness.progress import say
-from benchmarks.harness.results import Line, Results, digest, newest
+from benchmarks.harness.results import Line, Results, digest, newest, refuse_cut
 from benchmarks.harness.rows import Row
 from benchmarks.harness.study import PriorOptions, Summary, results_of, resumed
 from benchmarks.harness.tables import Table, ranged
@@ -72,13 +72,13 @@ def _measure(options: Options, prior: Prior, results: Results) -> None:
             for path in files(SETS[name], options.data, count):
                 same = {"prior": prior.identity, "condition": SETS[name], "object": path.stem, "seed": seed}
                 lines = [{**same, "method": method_of(number), "settings": settings} for number in COUNTS]
-                if lines[0] in results:
+                if all(line in results for line in lines):
                     continue
-                for line, told in zip(lines, answers(path, prior, config, scene, seed), strict=False):
-                    results.add({**line, **told})
-                    say(
-                        f"{path.stem}, seed {seed}, {line['method']}: " + ", ".join(f"{k} {v}" for k, v in told.items())
-                    )
+                for line, told in zip(lines, answers(path, prior, config, scene, seed), strict=True):
+                    if line not in results:
+                        results.add({**line, **told})
+                        shown = ", ".join(f"{k} {v}" for k, v in told.items())
+                        say(f"{path.stem}, seed {seed}, {line['method']}: {shown}")
 
 
 def method_of(number: int) -> str:
@@ -88,8 +88,11 @@ def method_of(number: int) -> str:
 
 def answers(
     path: Path, prior: Prior, config: ControllerConfig, scene: StrangerConfig, seed: int
-) -> Iterator[dict[str, Any]]:
-    """What is kept of the answer after each run; `refused`, and no more, where perception does not take the object."""
+) -> list[dict[str, Any]]:
+    """What is kept of the answer after each run, null for NaN; `refused` where perception does not take the object.
+
+    Raises KeyboardInterrupt where that ended a run.
+    """
     seen = stranger(path, scene)
     points, occupied = hidden_points(seen, scene)
     begun = time.monotonic()
@@ -97,20 +100,23 @@ def answers(
         inference = inference_of(seen.frame, segment(seen.frame, 1)[0], prior, config, seed=seed)
         inference.begin()
     except ValueError as error:
-        yield {"refused": str(error)}
-        return
+        return [{"refused": str(error)} for _ in COUNTS]
+    found = []
     while not inference.done:
         inference.step(runs=1)
         assert inference.answer is not None
+        refuse_cut(inference.answer.result)
         seconds = time.monotonic() - begun
         h = replace(inference.answer, out_of_model=False)  # before any alarm's caution
         p = np.array(query([h], Points(points), "camera", now_ns=h.stamp_ns).p_occupied_few)
-        yield {
+        values = {
             "balanced": round(float(point_scores(p, occupied)["balanced"]), 4),
             "expected_loss": round(h.diagnostics.expected_loss, 5),
             "explained": round(h.diagnostics.explained, 4),
             "seconds": round(seconds, 1),
         }
+        found.append({name: None if np.isnan(value) else value for name, value in values.items()})
+    return found
 
 
 def summary(lines: list[Line], options: Options) -> Summary | None:
@@ -131,7 +137,9 @@ def _rows(condition: str, whole: dict[tuple[str, int], dict[str, Line]]) -> list
     stops = [_stop([by[method_of(number)] for number in COUNTS]) for by in whole.values()]
 
     def by_object(number: int, metric: str = "balanced") -> list[list[float]]:
-        return [[by[method_of(number)][metric] for (own, _), by in whole.items() if own == name] for name in objects]
+        return [
+            [_value(by[method_of(number)], metric) for (own, _), by in whole.items() if own == name] for name in objects
+        ]
 
     one, rows = [float(np.mean(values)) for values in by_object(1)], []
     for number in COUNTS:
@@ -140,13 +148,17 @@ def _rows(condition: str, whole: dict[tuple[str, int], dict[str, Line]]) -> list
         rows += mean_rows("runs", name, condition, "balanced", means, "nats")
         if number > 1:
             rows += gap_rows("runs", name, condition, "above_one", means, one)
-        spread = [max(values) - min(values) for values in scores if len(values) > 1]
+        spread = [float(np.ptp(values)) for values in scores if len(values) > 1]
         rows += mean_rows("runs", name, condition, "spread", spread, "nats") if spread else []
         for metric, unit in (("expected_loss", "nats"), ("seconds", "s")):
-            value = float(np.mean([np.mean(values) for values in by_object(number, metric)]))
+            value = interval([float(np.mean(values)) for values in by_object(number, metric)]).mean
             rows.append(Row("runs", name, condition, metric, value, unit, len(whole)))
         rows.append(Row("runs", name, condition, "rule", float(np.mean(np.equal(stops, number))), "", len(whole)))
     return rows
+
+
+def _value(line: Line, metric: str) -> float:
+    return float("nan") if line[metric] is None else line[metric]
 
 
 def _stop(after: Sequence[Line]) -> int:
@@ -154,7 +166,7 @@ def _stop(after: Sequence[Line]) -> int:
     config, runs = ControllerConfig(), 1
     while True:
         line = after[runs - 1]
-        found = Findings(runs, line["expected_loss"], 1.0 - line["explained"])
+        found = Findings(runs, _value(line, "expected_loss"), 1.0 - _value(line, "explained"))
         wanted = runs_wanted(found, min(config.runs, len(after)), config.tolerance, config.unexplained)
         if wanted <= runs:
             return runs
