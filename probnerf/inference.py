@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array
@@ -21,7 +22,7 @@ from probnerf.sampling.defensive_mixture import DefensiveMixture
 from probnerf.sampling.gaussian_mixture import GaussianMixture
 from probnerf.sampling.hmc import Reference, StageInfo
 from probnerf.sampling.modes import mixture_of_modes
-from probnerf.sampling.populations import from_draws, start_from
+from probnerf.sampling.populations import from_draws, start_from, with_log_likelihoods
 from probnerf.sampling.tempered_smc import tempered_smc
 from probnerf.settings import InferConfig, TemperedSMCConfig
 from probnerf.types import Observation, Posterior
@@ -61,19 +62,20 @@ def with_sizes(likelihood: Likelihood, observation: Observation) -> Likelihood:
     The numbers are padded, so that most views share one compiled program.
     """
     lattice = likelihood.lattice
-    each = np.sum(np.asarray(faces_of_view(observation, likelihood)) < foam.FAR, axis=1)
+    each = np.sum(np.asarray(faces_of_view(observation, likelihood)) < foam.FAR, axis=-1)
 
     def padded(count: int, step: int) -> int:
         return step * max(1, math.ceil(count / step))
 
     most = min(padded(each.max(), 64), 3 * lattice.planes)
-    packed = (padded(each[: observation.colour_count].sum(), 512), padded(each.sum(), 1024))
+    colour = each[..., : observation.colour_count]
+    packed = (padded(colour.sum(axis=-1).max(), 512), padded(each.sum(axis=-1).max(), 1024))
     return replace(likelihood, lattice=replace(lattice, max_crossings=most), packed=packed)
 
 
-def crossings_of(likelihood: Likelihood, observation: Observation) -> int:
-    """Number of crossings of a view, at which the field is evaluated for each particle."""
-    return int(np.sum(np.asarray(faces_of_view(observation, likelihood)) < foam.FAR))
+def crossings_of(likelihood: Likelihood, observation: Observation) -> float:
+    """Number of crossings of a view, at which the field is evaluated for each particle, on average."""
+    return float(np.sum(np.asarray(faces_of_view(observation, likelihood)) < foam.FAR)) / observation.choices
 
 
 def without_sizes(likelihood: Likelihood) -> Likelihood:
@@ -104,7 +106,7 @@ def modes_of(
     assert isinstance(model, ProbNeRF) and picture is not None
     likelihood = likelihood_of(config, observation)
     starts = guesses(key, model, picture, config.modes.starts)
-    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
+    args = _args(model, likelihood, observation)
     return mixture_of_modes(args, starts, config.modes)
 
 
@@ -136,6 +138,11 @@ def infer(
 ) -> tuple[Posterior, Likelihood]:
     """Sample p(z~, pose, delta | observation).
 
+    Where the observation has several choices of pixels, every population or chain is given one of them, in turn. All
+    together then are draws of the bagged posterior (Huggins and Miller 2023, arXiv 2007.14845): the posterior's mean
+    over which pixels are compared. Where the model is wrong, one choice's posterior is certain of what another denies.
+    Evidences are each of its own pixels. The log-likelihoods of the samples are means over all choices.
+
     `reference` is the density at which tempering starts: of `modes_of` or `network_start.defensive` (None: the prior).
     `before` replaces it: an unfinished posterior of the same latents, from which to continue. `deadline` is on
     time.monotonic()'s clock.
@@ -144,20 +151,40 @@ def infer(
     """
     config = config or InferConfig()
     likelihood = likelihood_of(config, observation, sample_pose)
-    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
     dim = likelihood.dim(model)
     if config.method == "annealed_hmc":
         hmc = (
             config.hmc if stages is None else replace(config.hmc, iterations=stages, keep=min(config.hmc.keep, stages))
         )
-        return annealed_hmc(key, log_likelihood, args, dim, hmc, on_stage=on_stage, deadline=deadline), likelihood
-    smc = sampler_of(config, reference, before)
-    initial = None if before is None else start_from(before, smc.populations)
-    posterior = tempered_smc(
-        key, log_likelihood, args, dim, smc, initial=initial, reference=reference if before is None else None,
-        on_stage=on_stage, deadline=deadline, stages=stages,
-    )  # fmt: skip
-    return posterior, likelihood
+        args = _args(model, likelihood, _dealt(observation, hmc.chains))
+        posterior = annealed_hmc(key, log_likelihood, args, dim, hmc, on_stage=on_stage, deadline=deadline)
+    else:
+        smc = sampler_of(config, reference, before)
+        args = _args(model, likelihood, _dealt(observation, smc.populations))
+        initial = None if before is None else start_from(before, smc.populations)
+        posterior = tempered_smc(
+            key, log_likelihood, args, dim, smc, initial=initial, reference=reference if before is None else None,
+            on_stage=on_stage, deadline=deadline, stages=stages,
+        )  # fmt: skip
+    return _compared(posterior, model, likelihood, observation), likelihood
+
+
+def _args(model: Model, likelihood: Likelihood, observation: Observation) -> tuple[Any, ...]:
+    return model, likelihood, observation, faces_of_view(observation, likelihood)
+
+
+def _dealt(observation: Observation, groups: int) -> Observation:
+    """One of its choices of pixels for each of so many groups of positions, in turn."""
+    return observation if observation.choices == 1 else observation.chosen(np.arange(groups) % observation.choices)
+
+
+def _compared(posterior: Posterior, model: Model, likelihood: Likelihood, observation: Observation) -> Posterior:
+    """The posterior with log-likelihoods that are comparable: the mean over all choices of pixels."""
+    if observation.choices == 1:
+        return posterior
+    each = [_args(model, likelihood, observation.chosen(k)) for k in range(observation.choices)]
+    every = [np.asarray(_log_likelihood(args, posterior.positions)) for args in each]
+    return with_log_likelihoods(posterior, np.mean(every, axis=0))
 
 
 def encoder_guess(
@@ -180,7 +207,7 @@ def encoder_guess(
     else:
         yaws, draws = 1, yaws * draws
         positions = guesses(key, model, picture, draws, sample_pose=False)
-    args = (model, likelihood, observation, faces_of_view(observation, likelihood))
+    args = _args(model, likelihood, observation)
     values = np.asarray(_log_likelihood(args, positions), np.float64)
     values = np.where(np.isfinite(values), values, -np.inf)
     top = values.max()

@@ -42,6 +42,8 @@ class Observation(eqx.Module):
 
     Rays `[0, colour_count)` may be OBJECT pixels and carry colour; later ones never do: the colour network skips them.
     A padding ray has status UNKNOWN and limit 0: it says nothing.
+
+    Arrays other than `pose_sigma` may carry a leading axis (`stacked`): several choices of N pixels of the same view.
     """
 
     rays: Rays
@@ -60,8 +62,18 @@ class Observation(eqx.Module):
     colour_count: int = eqx.field(static=True)
 
     def __check_init__(self) -> None:
-        if self.colour_count > self.status.shape[0]:
-            raise ValueError(f"colour_count {self.colour_count} exceeds the {self.status.shape[0]} rays")
+        if self.colour_count > self.status.shape[-1]:
+            raise ValueError(f"colour_count {self.colour_count} exceeds the {self.status.shape[-1]} rays")
+
+    @property
+    def choices(self) -> int:
+        """How many choices of pixels it holds."""
+        return self.status.shape[0] if self.status.ndim > 1 else 1
+
+    def chosen(self, index: ArrayLike | Int[Array, "..."]) -> "Observation":
+        """One choice of pixels, by its number, or several by theirs. Requires a leading axis."""
+        per_ray = {name: jax.tree.map(lambda a: a[index], getattr(self, name)) for name in _PER_RAY}
+        return Observation(**per_ray, pose_sigma=self.pose_sigma, colour_count=self.colour_count)
 
 
 _PER_RAY = ("rays", "status", "rgb", "rgb_valid", "range", "range_sigma", "range_valid", "limit")
@@ -78,6 +90,14 @@ def joined(observations: Sequence[Observation]) -> Observation:
     whole = jax.device_put(jax.tree.map(lambda *a: np.concatenate(a), *parts))
     count = sum(o.colour_count for o in observations)
     return Observation(**whole, pose_sigma=observations[0].pose_sigma, colour_count=count)
+
+
+def stacked(observations: Sequence[Observation]) -> Observation:
+    """Several choices of one view's pixels, of equal numbers of rays, along a leading axis."""
+    first = observations[0]
+    every = {name: [getattr(o, name) for o in observations] for name in _PER_RAY}
+    whole = {name: jax.tree.map(lambda *a: np.stack([np.asarray(x) for x in a]), *o) for name, o in every.items()}
+    return Observation(**jax.device_put(whole), pose_sigma=first.pose_sigma, colour_count=first.colour_count)
 
 
 class Pose(eqx.Module):

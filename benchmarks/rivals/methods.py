@@ -216,9 +216,7 @@ def _estimate(
         populations = {name: replace(getattr(own, name), **(smc or {})) for name in SAMPLERS}
         sampler = replace(own, **(infer or {}), **populations)
         limits = {"stages": None if stages is None else 2} if short else {"stages": stages, "budget_s": budget_s}
-        config = replace(q.config, infer=sampler)
-        if runs is not None:
-            config = replace(config, runs=runs, unexplained=1.0, tolerance=0.0)
+        config = replace(q.config, infer=sampler, runs=runs or q.config.runs)
         begun = time.monotonic()
         found = estimate(q.view.frame, q.view.segment, q.prior, config, seed=q.seed, **limits)
         seconds = time.monotonic() - begun
@@ -226,10 +224,7 @@ def _estimate(
         cube, likelihood = found.object_frame, found.likelihood
         return Sampled(found.posterior, found.observation, likelihood, cube, float(gradients), seconds=seconds)
 
-    ours = ControllerConfig()
-    amount: dict[str, Any] = {"runs": runs}
-    if runs is None:
-        amount = {"runs": ours.runs, "unexplained": ours.unexplained, "tolerance": ours.tolerance}
+    amount = {"runs": runs or ControllerConfig().runs}
     settings = {"stages": stages, "budget_s": budget_s, **amount, **(infer or {}), **(smc or {})}
     programs = "" if budget_s is None else group  # one budget compiles what another needs
     return Method(name, group, label, sample, settings, conditions, programs, smc=True, base=base)

@@ -1,19 +1,17 @@
 """What further runs of the sampler bring: an answer after one run, two, three and four.
 
 Strangers as `farside bench strangers` shows them: scans to choose by, and the household generator's validation objects.
-All four runs are made of each, whatever the controller would do, with two seeds; after each the answer is published
-and scored. A run begins anew; the answer is of all runs together, and has 48 shapes however many there are.
+All four runs are made of each, with two seeds; after each the answer is published and scored. A run begins anew; the
+answer is of all runs together, and has 48 shapes however many there are.
 
 - balanced: as in `farside bench strangers`, the mean of an object's seeds; above_one: less that of one run, paired.
 - spread: the larger seed's score less the smaller one's, mean over objects with both.
 - expected_loss: what the answer itself expects to lose by few populations (`publish.expected_loss`), nats a voxel.
-- rule: share of the answers at which the controller would stop (`perception.inference.run_plan`).
 - seconds: until the answer, a mean, with the answers published after the runs before, and what had to be compiled.
 """
 
 import time
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -34,7 +32,6 @@ from benchmarks.scenes.strangers import DATA, SETS, StrangerConfig, files, hidde
 from perception.answers.query import query
 from perception.answers.regions import Points
 from perception.inference.controller import inference_of
-from perception.inference.run_plan import Findings, runs_wanted
 from perception.inference.settings import ControllerConfig
 from perception.observation.segmentation import segment
 from probnerf.prior.checkpoint import Prior, load_prior
@@ -64,7 +61,7 @@ def main(options: Options) -> Summary:
 
 
 def _measure(options: Options, prior: Prior, results: Results) -> None:
-    config, scene = replace(ControllerConfig(), unexplained=0.0, tolerance=0.0, runs=COUNTS[-1]), StrangerConfig()
+    config, scene = replace(ControllerConfig(), runs=COUNTS[-1]), StrangerConfig()
     settings = {"digest": digest([asdict(config), asdict(scene)], options.quick)}
     count = 1 if options.quick else options.n
     for name in ("gso", "household") if options.set == "both" else (options.set,):
@@ -103,7 +100,7 @@ def answers(
         return [{"refused": str(error)} for _ in COUNTS]
     found = []
     while not inference.done:
-        inference.step(runs=1)
+        inference.step()
         assert inference.answer is not None
         refuse_cut(inference.answer.result)
         seconds = time.monotonic() - begun
@@ -134,7 +131,6 @@ def summary(lines: list[Line], options: Options) -> Summary | None:
 
 def _rows(condition: str, whole: dict[tuple[str, int], dict[str, Line]]) -> list[Row]:
     objects = list(dict.fromkeys(name for name, _ in whole))
-    stops = [_stop([by[method_of(number)] for number in COUNTS]) for by in whole.values()]
 
     def by_object(number: int, metric: str = "balanced") -> list[list[float]]:
         return [
@@ -153,7 +149,6 @@ def _rows(condition: str, whole: dict[tuple[str, int], dict[str, Line]]) -> list
         for metric, unit in (("expected_loss", "nats"), ("seconds", "s")):
             value = interval([float(np.mean(values)) for values in by_object(number, metric)]).mean
             rows.append(Row("runs", name, condition, metric, value, unit, len(whole)))
-        rows.append(Row("runs", name, condition, "rule", float(np.mean(np.equal(stops, number))), "", len(whole)))
     return rows
 
 
@@ -161,22 +156,10 @@ def _value(line: Line, metric: str) -> float:
     return float("nan") if line[metric] is None else line[metric]
 
 
-def _stop(after: Sequence[Line]) -> int:
-    """After how many runs the controller would have stopped."""
-    config, runs = ControllerConfig(), 1
-    while True:
-        line = after[runs - 1]
-        found = Findings(runs, _value(line, "expected_loss"), 1.0 - _value(line, "explained"))
-        wanted = runs_wanted(found, min(config.runs, len(after)), config.tolerance, config.unexplained)
-        if wanted <= runs:
-            return runs
-        runs = wanted
-
-
 def _tables(of: Figures) -> list[Table]:
     header = (
         "runs", "objects", "balanced, nats", "above one run's, paired", "largest less smallest seed",
-        "expected loss, nats a voxel", "the controller stops here", "seconds",
+        "expected loss, nats a voxel", "seconds",
     )  # fmt: skip
     found = []
     for c in of.conditions():
@@ -188,7 +171,6 @@ def _tables(of: Figures) -> list[Table]:
                 ranged(of.interval(c, m, "above_one"), sign="+") if (c, m, "above_one") in of else "",
                 ranged(of.interval(c, m, "spread")) if (c, m, "spread") in of else "",
                 f"{of(c, m, 'expected_loss'):.4f}",
-                f"{of(c, m, 'rule'):.0%} of {of.count(c, m, 'rule')}",
                 f"{of(c, m, 'seconds'):.0f}",
             ]
             for m in of.methods(c)

@@ -9,7 +9,7 @@ from perception.inference.limits import NO_CALLBACKS, NO_LIMITS, Callbacks, Limi
 from perception.inference.publish import ConditionedView
 from perception.inference.settings import ControllerConfig
 from perception.observation.object_frame import ObjectFrame
-from perception.observation.rays import observe
+from perception.observation.rays import observations
 from perception.observation.segmentation import Segment
 from perception.observation.visibility import seen_voxels
 from perception.sources.frame import Frame
@@ -60,9 +60,9 @@ def inference_of(
 ) -> Inference:
     """The inference of one object of a frame, not begun. Raises as `estimate`."""
     config = config or ControllerConfig()
-    observation, cube = observe(frame, segment, config.observe, seed, known)
+    chosen, cube = observations(frame, segment, config.observe, seed, known)
     seen = seen_voxels(frame, segment, cube, config.grid)
-    view = ConditionedView(frame, segment, observation, cube, seen, pose_known=known is not None)
+    view = ConditionedView(frame, segment, chosen, cube, seen, pose_known=known is not None)
     return Inference(view, prior, config, seed, limits=limits, callbacks=callbacks)
 
 

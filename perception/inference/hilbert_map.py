@@ -134,8 +134,10 @@ def hilbert_map(frame: Frame, segment: Segment, config: HilbertMapConfig | None 
 
 def thinned(points: Float[np.ndarray, "n 3"], cell: float) -> Float[np.ndarray, "k 3"]:
     """The mean of the points in each cubic cell that holds some."""
-    _, index, count = np.unique(np.floor(points / cell), axis=0, return_inverse=True, return_counts=True)
-    index = index.ravel()
+    cells = np.floor(points / cell).astype(np.int64)
+    cells -= cells.min(axis=0)
+    number = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))  # unique rows would take much longer
+    _, index, count = np.unique(number, return_inverse=True, return_counts=True)
     return np.column_stack([np.bincount(index, points[:, axis]) for axis in range(3)]) / count[:, None]
 
 

@@ -3,12 +3,11 @@
 If the prior has a posterior network, its draws are the first answer. Where their importance weights are good enough,
 these are the last one. Else sampling begins there.
 
-A run is a small sampler: a few independent populations of a few particles. Without a network, they begin where climbs
-from the encoder's guesses end. From the populations' disagreement about unseen space follows the score that their small
-number is expected to lose there (`publish.expected_loss`). If it is above the tolerance, the controller makes the
-further runs that should reduce it enough (it falls with their number), and pools their populations. If the shapes leave
-too many pixels unexplained (a posterior-predictive check), it makes all allowed runs. An answer can be published from
-the start, and a better one after each step.
+A run is a small sampler: a few independent populations of a few particles, each of which compares its own choice of the
+view's pixels. Without a network, they begin where climbs from the encoder's guesses end. One run is the answer: with
+more, whose populations are pooled, no score was better on any object tried (`farside bench runs`), whatever the
+populations' disagreement about unseen space says that they are expected to gain (`publish.expected_loss`). An answer
+can be published from the start, and a better one after each step.
 
 Lattice and rays are the same for every scene. With half of both, shapes were worse on easy and hard scenes, and no
 check predicted where (`farside bench frontier` can measure a coarse lattice).
@@ -24,7 +23,6 @@ import numpy as np
 from perception.answers.hypotheses import Hypotheses
 from perception.inference.limits import NO_CALLBACKS, NO_LIMITS, Callbacks, Limits
 from perception.inference.publish import ConditionedView, published
-from perception.inference.run_plan import Findings, runs_wanted
 from perception.inference.settings import ControllerConfig, PublishConfig
 from perception.inference.view_sampler import ViewSampler
 from perception.observation.object_frame import ObjectFrame
@@ -47,14 +45,14 @@ class Estimate:
     observation: Observation
     object_frame: ObjectFrame
     seconds: float
-    log: tuple[str, ...] = ()  # why there were more runs, and why no more, a line an answer
+    log: tuple[str, ...] = ()  # what each answer found, and why there were no more, a line each
     parts: dict[str, float] = field(default_factory=dict)  # s; of them: network, climbing, sampling, publishing
     start: str = ""  # where sampling began, in words
 
 
 @dataclass(eq=False)
 class Inference:
-    """Samples the posterior of a view and publishes it, in as many runs as it takes (`run_plan.runs_wanted`).
+    """Samples the posterior of a view and publishes it, in `config.runs` runs.
 
     `begin` first, then `step` until it is `done`. `before` is an interrupted posterior of the same view; one run
     continues from it. The limits are for all runs together. A further run that is cut short is left out.
@@ -70,7 +68,6 @@ class Inference:
     answer: Hypotheses | None = None  # the latest; none before the first run where no guess was asked for
     done: bool = False  # nothing is left to do, or a limit leaves no room for more
     _runs: list[Posterior] = field(default_factory=list)
-    _wanted: int = 1
     _cut: bool = False  # the only run is one that a step's deadline ended
     _log: list[str] = field(default_factory=list)
     _seconds: float = 0.0
@@ -79,6 +76,8 @@ class Inference:
         infer = suited(self.config.infer, self.prior.model)
         self._sampler = ViewSampler(self.view, self.prior, infer, self.seed, self.limits, self.before)
         self._publisher = _Publisher(self._sampler, self.config, self.callbacks)
+        again = self.before is None and infer.method == "tempered_smc"
+        self._wanted = self.config.runs if again else 1
 
     @property
     def loss(self) -> float:
@@ -117,42 +116,37 @@ class Inference:
             elif sampler.asks_encoder:
                 sampler.climb()
 
-    def step(self, runs: int | None = None, deadline: float | None = None) -> bool:
-        """Make the runs that are wanted, or so many of them at most, and publish; whether there was room for one.
+    def step(self, deadline: float | None = None) -> bool:
+        """Make a run, and publish; whether there was room for it.
 
         A `deadline` (of `time.monotonic`) is this step's; the limits are those of all steps. If it ends the first run,
         that run's samples are the answer, and the next step begins anew.
         """
         with self._counted():
-            return self._step(runs, deadline)
+            return self._step(deadline)
 
-    def _step(self, runs: int | None, deadline: float | None) -> bool:
+    def _step(self, deadline: float | None) -> bool:
         sampler, publisher = self._sampler, self._publisher
         if self._cut:
             self._runs, self._cut, sampler.stages = [], False, 0
         done, of_all = len(self._runs), self.limits.deadline
         last = deadline is None or (of_all is not None and of_all <= deadline)
         sampler.limits = self.limits if last else replace(self.limits, deadline=deadline)
-        most = self._wanted if runs is None else min(self._wanted, done + runs)
-        new, stop = sampler.more_runs(done, most, publisher.after_stage)
+        run, stop = sampler.next_run(done, publisher.after_stage)
         if stop == StopReason.BUDGET and not last:
-            self._cut, stop = bool(new) and new[0].result == StopReason.BUDGET and not done, None
-        if new:
-            self._runs += new
-            answer = publisher.publish_cut(self._runs) if self._cut else publisher.publish_runs(self._runs)
-            found = Findings(len(self._runs), answer.diagnostics.expected_loss, 1.0 - answer.diagnostics.explained)
-            if self.before is None and self.config.infer.method == "tempered_smc" and stop is None and not self._cut:
-                self._wanted = runs_wanted(found, self.config.runs, self.config.tolerance, self.config.unexplained)
-            self._log.append(publisher.log_line(found, answer.failed, self._wanted if stop is None else found.runs))
-            self.answer = answer
+            self._cut, stop = run is not None, None
+        if run is not None:
+            self._runs.append(run)
+            self.answer = publisher.publish_cut(self._runs) if self._cut else publisher.publish_runs(self._runs)
+            self._log.append(publisher.log_line(len(self._runs), self.answer))
         assert self.answer is not None
         if stop is None and not self._cut and len(self._runs) < self._wanted:
             stop = sampler.limit_reached() if last else None
-            if stop is None and new:  # better ones follow
+            if stop is None and run is not None:  # better ones follow
                 publisher.hand_out(replace(self.answer, result=StopReason.UNDERWAY))
         if stop is not None or (len(self._runs) >= self._wanted and not self._cut):
             self._end(self.answer, stop)
-        return bool(new)
+        return run is not None
 
     def _end(self, answer: Hypotheses, stop: StopReason | None = None) -> None:
         if stop is not None and len(self._runs) < self._wanted:
@@ -256,18 +250,13 @@ class _Publisher:
         line += f", halves {draws.apart:.2f} nats apart"
         return line + (": no tempering is needed" if enough else " -> tempering from there")
 
-    def log_line(self, found: Findings, failed: int, wanted: int) -> str:
-        """A log line: the findings of the runs so far, and whether more are wanted."""
-        line = f"{self._particles(found.runs)}: "
-        known = np.isfinite(found.expected_loss)
-        line += f"expected loss {found.expected_loss:.4f} nats" if known else "expected loss not known"
-        line += f", {100 * found.unexplained:.0f}% of pixels not explained"
-        if failed:
-            line += f", populations that failed and are left out: {failed}"
-        return line + (f" -> {self._particles(wanted)}" if wanted > found.runs else "")
-
-    def _particles(self, runs: int) -> str:
-        return f"{runs * self.sampler.smc.populations} x {self.sampler.smc.particles} particles"
+    def log_line(self, runs: int, answer: Hypotheses) -> str:
+        """A log line: the findings of so many runs."""
+        loss, smc = answer.diagnostics.expected_loss, self.sampler.smc
+        line = f"{runs * smc.populations} x {smc.particles} particles: "
+        line += f"expected loss {loss:.4f} nats" if np.isfinite(loss) else "expected loss not known"
+        line += f", {100 * (1.0 - answer.diagnostics.explained):.0f}% of pixels not explained"
+        return line + (f", populations that failed and are left out: {answer.failed}" if answer.failed else "")
 
     def _hand_out_early(self, posterior: Posterior) -> Hypotheses:
         """An answer that is cheaper to make."""

@@ -24,7 +24,7 @@ from probnerf.prior.networks import ProbNeRF
 from probnerf.rendering.occupancy import WALL_OPACITY
 from probnerf.sampling.populations import thin
 from probnerf.shapes import explained, opacity_grids, poses, scaled_about
-from probnerf.types import Observation, Posterior
+from probnerf.types import Observation, Posterior, joined, stacked
 
 # chosen by the scans' scores (`farside bench strangers`)
 HEDGE = 2.0  # 1 to 4 are as good within 0.01 nats
@@ -37,10 +37,25 @@ class ConditionedView:
 
     frame: Frame
     segment: Segment
-    observation: Observation  # of this frame, or of several joined
+    observations: tuple[Observation, ...]  # of this frame, or of several joined; each of its own choice of pixels
     object_frame: ObjectFrame  # in this frame's camera
     seen: Bool[np.ndarray, "g g g"]  # by any frame
     pose_known: bool = False  # `object_frame` is the object's own cube (the handle at +x): only the shape is inferred
+
+    @property
+    def observation(self) -> Observation:
+        """Of the first choice of pixels."""
+        return self.observations[0]
+
+    @cached_property
+    def every_choice(self) -> Observation:
+        """All choices of pixels, along a leading axis."""
+        return stacked(self.observations) if len(self.observations) > 1 else self.observation
+
+    @cached_property
+    def every_pixel(self) -> Observation:
+        """The pixels of all choices as one observation."""
+        return joined(self.observations)
 
     @cached_property
     def smooth_map(self) -> HilbertMap:
@@ -66,7 +81,8 @@ def published(
     """
     chosen = _thinned(posterior, config.hypotheses)
     sizeless, pose_sigma = without_sizes(likelihood), view.observation.pose_sigma
-    each = explained(prior.model, sizeless, view.observation, _padded(chosen[0], config.hypotheses))
+    pixels = view.every_pixel if config.coarse == 1 else view.observation  # an early answer is cheaper in this, too
+    each = explained(prior.model, sizeless, pixels, _padded(chosen[0], config.hypotheses))
     fit = float(chosen[1] @ np.asarray(each, np.float64)[: len(chosen[1])])
     smooth = 0
     if guess is not None and fit < 1.0:

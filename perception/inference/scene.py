@@ -99,7 +99,7 @@ def _runs(waiting: list[tuple[Segment, Inference]], end: float, answer_s: float)
             continue
         inference.begin()
         if not inference.done:
-            inference.step(1, now + max(share - answer_s, 0.5))
+            inference.step(now + max(share - answer_s, 0.5))
         if inference.interrupted:
             return True
     while waiting:
@@ -113,7 +113,7 @@ def _runs(waiting: list[tuple[Segment, Inference]], end: float, answer_s: float)
         if not open_to:
             break
         chosen = max(open_to, key=lambda inference: inference.loss)
-        chosen.step(1)
+        chosen.step()
         if chosen.interrupted:
             return True
     return False

@@ -27,23 +27,19 @@ class PublishConfig:
 
 @dataclass(frozen=True)
 class ControllerConfig(PublishConfig):
-    """The most that is inferred, when inference may stop earlier, and how finely results are published."""
+    """How much is inferred, and how finely results are published."""
 
     infer: InferConfig = field(default_factory=InferConfig)  # of one run
     observe: ObserveConfig = field(default_factory=ObserveConfig)
     first_hypotheses: int = 24  # published while better ones are under way; 48 score no better
     first_coarse: int = 2  # their `coarse`: 48 shapes at 2 cost less than 8 at 1
-    unexplained: float = 0.1  # share of pixels above which all runs are made
-    tolerance: float = 0.005  # nats per voxel of unseen space; accepted loss from having few populations
-    runs: int = 4  # at most
+    runs: int = 1  # of the sampler; their populations answer together (`farside bench runs`: more bring nothing)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if min(self.first_hypotheses, self.first_coarse, self.runs) < 1:
             first = f"first_hypotheses {self.first_hypotheses}, first_coarse {self.first_coarse}"
             raise ValueError(f"{first} and runs {self.runs} must be 1 or more")
-        if not (self.tolerance >= 0.0 and 0.0 <= self.unexplained <= 1.0):
-            raise ValueError(f"tolerance {self.tolerance:g} must be 0 or more, unexplained {self.unexplained:g} 0 to 1")
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from perception.inference.limits import NO_CALLBACKS, NO_LIMITS, Callbacks, Limi
 from perception.inference.publish import ConditionedView
 from perception.inference.settings import ControllerConfig, TrackConfig
 from perception.observation.object_frame import ObjectFrame, object_frame
-from perception.observation.rays import observe
+from perception.observation.rays import observations
 from perception.observation.segmentation import Segment
 from perception.observation.visibility import seen_voxels
 from perception.sources.frame import Frame
@@ -60,7 +60,7 @@ class Update:
 class _Kept:
     """One view of the posterior's condition."""
 
-    observation: Observation
+    observations: tuple[Observation, ...]  # each of its own choice of pixels
     direction: Float[np.ndarray, "3"]  # from the cube's centre to the camera, unit
 
 
@@ -151,17 +151,17 @@ class Tracker:
         agreement = float("nan")
         if track is not None and not fresh:
             cube = track.anchor.seen_from(_moved_by(track.first, frame))
-            observation, _ = observe(frame, segment, self.config.observe, seed, cube)
-            agreement = self._agreement(track.posterior, observation)
+            chosen_pixels, _ = observations(frame, segment, self.config.observe, seed, cube)
+            view = ConditionedView(frame, segment, chosen_pixels, cube, track.seen)
+            agreement = self._agreement(track.posterior, view.every_pixel)
             still = frame.T_world_camera is not None or _same_plane(cube.plane, found.plane, self.track)
-            view = ConditionedView(frame, segment, observation, cube, track.seen)
             if still and agreement >= self.track.moved_below:
                 return self._go_on(name, track, view, agreement, seed)
             change = Change.MOVED
-        observation, _ = observe(frame, segment, self.config.observe, seed, found)
+        chosen_pixels, _ = observations(frame, segment, self.config.observe, seed, found)
         seen = seen_voxels(frame, segment, found, self.config.grid)
-        view = ConditionedView(frame, segment, observation, found, seen)
-        return Look(name, change, agreement, None, seed, view, (_Kept(observation, _direction(found)),), None)
+        view = ConditionedView(frame, segment, chosen_pixels, found, seen)
+        return Look(name, change, agreement, None, seed, view, (_Kept(chosen_pixels, _direction(found)),), None)
 
     def infer(self, look: Look, limits: Limits = NO_LIMITS, callbacks: Callbacks = NO_CALLBACKS) -> Update:
         """Do the sampling that a look requires, and store the result. If the object has hypotheses already, the
@@ -227,7 +227,7 @@ class Tracker:
         whole = track.posterior.result == StopReason.CONVERGED
         change = Change.SAME if whole else Change.CONTINUED
         if adds:
-            kept = _with_view(kept, _Kept(view.observation, _direction(view.object_frame)), self.track)
+            kept = _with_view(kept, _Kept(view.observations, _direction(view.object_frame)), self.track)
             change = Change.VIEW
         h = replace(
             track.hypotheses,
@@ -236,7 +236,8 @@ class Tracker:
             object_frame=view.object_frame,
             T_world_camera=view.frame.T_world_camera,
         )
-        view = replace(view, observation=joined([k.observation for k in kept]), seen=track.seen | seen)
+        together = tuple(joined(each) for each in zip(*(k.observations for k in kept), strict=True))
+        view = replace(view, observations=together, seen=track.seen | seen)
         return Look(name, change, agreement, h, seed, view, kept, track)
 
     def _agreement(self, posterior: Posterior, observation: Observation) -> float:

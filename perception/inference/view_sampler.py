@@ -53,7 +53,7 @@ class ViewSampler:
     @cached_property
     def likelihood(self) -> Likelihood:
         """Of the view."""
-        return likelihood_of(self.config, self.view.observation, not self.view.pose_known)
+        return likelihood_of(self.config, self.view.every_choice, not self.view.pose_known)
 
     @property
     def smc(self) -> TemperedSMCConfig:
@@ -152,25 +152,19 @@ class ViewSampler:
         climbed = self.config.modes.gradients(self.likelihood.dim(model))
         self.point_gradients += climbed * crossings_of(self.likelihood, observation)
 
-    def more_runs(
-        self, done: int, wanted: int, on_stage: Callable[[StageInfo], bool | None]
-    ) -> tuple[list[Posterior], StopReason | None]:
-        """Runs number `done` to `wanted` - 1, and the reason if they ended early, else None.
+    def next_run(
+        self, number: int, on_stage: Callable[[StageInfo], bool | None]
+    ) -> tuple[Posterior | None, StopReason | None]:
+        """Run of this number, and the reason if it ended early, else None.
 
-        An interrupted run is left out, except the very first, which is better than none.
+        A run that was cut short is left out, except the very first, which is better than none.
         """
-        runs: list[Posterior] = []
-        for number in range(done, wanted):
-            limit = self.limit_reached() if number > 0 else None
-            if limit is not None:
-                return runs, limit
-            run = self.run(number, on_stage)
-            whole = run.result == StopReason.CONVERGED
-            if whole or number == 0:
-                runs.append(run)
-            if not whole:
-                return runs, run.result
-        return runs, None
+        limit = self.limit_reached() if number > 0 else None
+        if limit is not None:
+            return None, limit
+        run = self.run(number, on_stage)
+        whole = run.result == StopReason.CONVERGED
+        return run if whole or number == 0 else None, None if whole else run.result
 
     def run(self, number: int, on_stage: Callable[[StageInfo], bool | None]) -> Posterior:
         """One run, with its own random numbers; other threads' runs wait. `on_stage` gets the stages of all runs."""
@@ -190,7 +184,7 @@ class ViewSampler:
             posterior, _ = infer(
                 jax.random.fold_in(self._key, 10 + number) if number else self._key,
                 self.prior.model,
-                self.view.observation,
+                self.view.every_choice,
                 self.config,
                 reference=self._reference,
                 before=self.before,
@@ -200,7 +194,7 @@ class ViewSampler:
                 stages=stages,
             )
         self.stages += int(posterior.diagnostics.stages)
-        crossings = crossings_of(self.likelihood, self.view.observation)
+        crossings = crossings_of(self.likelihood, self.view.every_choice)
         self.point_gradients += float(posterior.diagnostics.point_gradients) * crossings
         return posterior
 

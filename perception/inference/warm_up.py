@@ -61,7 +61,7 @@ def _infer_twice(trial: Tracker, look: Look, frame: Frame, hidden: Segment) -> N
 
 def _sampled(trial: Tracker, look: Look, before: Posterior | None) -> Posterior:
     """One stage, from an answer that was cut short or from the prior."""
-    observation = look._view.observation
+    observation = look._view.every_choice
     key, config = jax.random.key(0), suited(trial.config.infer, trial.prior.model)
     posterior, _ = infer(key, trial.prior.model, observation, config, before=before, stages=1)
     if posterior.result == StopReason.INTERRUPTED:

@@ -1,6 +1,6 @@
 """From a segment of a frame to the model's observation: rays in the object's cube."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -40,6 +40,21 @@ def observe(
 ) -> tuple[Observation, ObjectFrame]:
     """One frame's observation of one object, as rays, and the rays' cube: `cube`, if it is known already.
 
+    It is the first of the `observations` with the same seed.
+    """
+    (first,), cube = observations(frame, segment, replace(config or ObserveConfig(), choices=1), seed, cube)
+    return first, cube
+
+
+def observations(
+    frame: Frame,
+    segment: Segment,
+    config: ObserveConfig | None = None,
+    seed: int = 0,
+    cube: ObjectFrame | None = None,
+) -> tuple[tuple[Observation, ...], ObjectFrame]:
+    """Observations of one object in one frame, each of its own choice of pixels, and the cube that is theirs.
+
     Rays: `colour_rays` OBJECT pixels (colour, and range where measured), then `free_rays` FREE pixels, then
     `occluder_rays` UNKNOWN pixels with the range up to which they are empty, less two sigma. Each group is well spread
     over its pixels and filled with padding, which has no effect. Deterministic in `seed`.
@@ -48,9 +63,11 @@ def observe(
     """
     config = config or ObserveConfig()
     cube = cube or object_frame(frame, segment, config)
-    window = _window_pixels(frame, segment, cube, config)
-    chosen = _chosen_pixels(window, config, np.random.default_rng(seed))
-    return _observation(window, chosen, pose_widths(frame.camera, cube, config), cube, config), cube
+    window, widths = _window_pixels(frame, segment, cube, config), pose_widths(frame.camera, cube, config)
+    seeds = [[seed], *([seed, number] for number in range(1, config.choices))]
+    cells = _cells_of(window, config)
+    chosen = [_chosen_pixels(cells, config, np.random.default_rng(own)) for own in seeds]
+    return tuple(_observation(window, pixels, widths, cube, config) for pixels in chosen), cube
 
 
 def _window_pixels(frame: Frame, segment: Segment, cube: ObjectFrame, config: ObserveConfig) -> _WindowPixels:
@@ -86,27 +103,55 @@ def _near_mask(
     return near[window]
 
 
-def _chosen_pixels(window: _WindowPixels, config: ObserveConfig, rng: np.random.Generator) -> Int[np.ndarray, "rays"]:
-    """Index of each ray's pixel, group by group: OBJECT, FREE, those that see an occluder; -1: padding.
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Areas of the window of which each ray draws its own pixel."""
 
-    Half of the free rays pass close to the object: they bound its outline.
-    """
+    objects: list[Int[np.ndarray, "k"]]
+    near: list[Int[np.ndarray, "k"]]  # FREE and close to the object: they bound its outline
+    free: list[Int[np.ndarray, "k"]]
+    occluders: list[Int[np.ndarray, "k"]]
 
-    def spread(candidates: Int[np.ndarray, "m"], count: int) -> Int[np.ndarray, "k"]:
-        return _spread(window.pixels, candidates, count, rng)
+
+def _cells_of(window: _WindowPixels, config: ObserveConfig) -> _Cells:
+    """Half of the free rays pass close to the object."""
+
+    def cells(candidates: Bool[np.ndarray, "n"], count: int) -> list[Int[np.ndarray, "k"]]:
+        return _halved(window.pixels, np.flatnonzero(window.meets_cube & candidates), count)
+
+    free = window.status == FREE
+    near = cells(free & window.near_outline, config.free_rays // 2)
+    return _Cells(
+        objects=cells(window.status == OBJECT, config.colour_rays),
+        near=near,
+        free=cells(free, config.free_rays - len(near)),
+        occluders=cells(window.occluder, config.occluder_rays),
+    )
+
+
+def _chosen_pixels(cells: _Cells, config: ObserveConfig, rng: np.random.Generator) -> Int[np.ndarray, "rays"]:
+    """Index of each ray's pixel, group by group: OBJECT, FREE, those that see an occluder; -1: padding."""
+
+    def drawn(areas: list[Int[np.ndarray, "k"]], taken: Int[np.ndarray, "t"]) -> Int[np.ndarray, "drawn"]:
+        pixels = []
+        for area in areas:
+            pixel = area[rng.integers(len(area))]
+            if pixel in taken:  # seldom
+                left = np.setdiff1d(area, taken)
+                pixels += [rng.choice(left)] if len(left) else []
+            else:
+                pixels.append(pixel)
+        return np.array(pixels, np.intp)
 
     def padded(indices: Int[np.ndarray, "k"], count: int) -> Int[np.ndarray, "count"]:
         return np.append(indices, np.full(count - len(indices), -1))
 
-    free = window.meets_cube & (window.status == FREE)
-    near = spread(np.flatnonzero(free & window.near_outline), config.free_rays // 2)
-    objects = spread(np.flatnonzero(window.meets_cube & (window.status == OBJECT)), config.colour_rays)
-    others = spread(np.setdiff1d(np.flatnonzero(free), near), config.free_rays - len(near))
-    occluders = spread(np.flatnonzero(window.meets_cube & window.occluder), config.occluder_rays)
+    none = np.array([], np.intp)
+    near = drawn(cells.near, none)
     groups = [
-        padded(objects, config.colour_rays),
-        padded(np.append(near, others), config.free_rays),
-        padded(occluders, config.occluder_rays),
+        padded(drawn(cells.objects, none), config.colour_rays),
+        padded(np.append(near, drawn(cells.free, near)), config.free_rays),
+        padded(drawn(cells.occluders, none), config.occluder_rays),
     ]
     return np.concatenate(groups).astype(np.intp)
 
@@ -206,20 +251,18 @@ def _meets_cube(
     return (far > np.maximum(near, 0.0)) & np.isfinite(directions).all(axis=1)
 
 
-def _spread(
-    pixels: Int[np.ndarray, "n 2"], candidates: Int[np.ndarray, "m"], count: int, rng: np.random.Generator
-) -> Int[np.ndarray, "k"]:
-    """`count` of the candidates (or all, if fewer), evenly over the area that they cover.
+def _halved(pixels: Int[np.ndarray, "n 2"], candidates: Int[np.ndarray, "m"], count: int) -> list[Int[np.ndarray, "k"]]:
+    """`count` parts of the candidates (or one each, if there are fewer), of even number and area.
 
-    The candidates are halved along their longer side until every cell holds one wanted pixel; each cell draws its own.
-    Pixels of one row or column keep their order, so that every machine draws the same.
+    The candidates are halved along their longer side until a part is left for every ray. Pixels of one row or column
+    keep their order, so that every machine makes the same.
     """
     if len(candidates) <= count:
-        return candidates
+        return list(candidates[:, None])
     if count <= 1:
-        return rng.choice(candidates, count)
+        return [candidates] * count
     first = count // 2
     cut = round(len(candidates) * first / count)
     side = int(np.ptp(pixels[candidates], axis=0).argmax())
     order = candidates[np.argsort(pixels[candidates, side], kind="stable")]
-    return np.append(_spread(pixels, order[:cut], first, rng), _spread(pixels, order[cut:], count - first, rng))
+    return _halved(pixels, order[:cut], first) + _halved(pixels, order[cut:], count - first)

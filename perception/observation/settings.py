@@ -110,8 +110,9 @@ class ObjectFrameConfig:
 
 @dataclass(frozen=True)
 class ObserveConfig(ObjectFrameConfig):
-    """How a segment becomes an Observation. Ray counts are fixed, so that no frame needs a new compilation."""
+    """How a segment becomes Observations. Ray counts are fixed, so that no frame needs a new compilation."""
 
+    choices: int = 8  # of pixels: each population of the sampler compares its own (`probnerf.inference.infer`)
     colour_rays: int = 32  # OBJECT pixels
     free_rays: int = 26  # FREE pixels, half of them near the outline
     occluder_rays: int = 6  # UNKNOWN pixels that see something nearer
@@ -121,3 +122,8 @@ class ObserveConfig(ObjectFrameConfig):
     outline_band: float = 0.25  # cube units on either side of the mask that count as near its outline
     range_offset_sigma: float = 0.005  # m; bias shared by all ranges of a view
     plane_sigma: float = 0.005  # m; of the plane's height, measured at a grazing angle
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.choices < 1:
+            raise ValueError(f"choices is {self.choices}; give 1 or more")

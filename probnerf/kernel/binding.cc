@@ -103,22 +103,28 @@ static ffi::Error view_terms(F32 weights, F32 pose, F32 origin, F32 direction, F
                              F32 range_sigma, F32 limit, F32 weight, S32 status, S32 rgb_valid, S32 range_valid, F32Result values,
                              F32Result g_weights, F32Result g_pose, FieldSizes field, float mask_error, float outlier,
                              float outlier_span, float wall_sigma, float colour_sigma, float per_density,
-                             int32_t colour_count, int32_t threads, std::string_view isa) {
+                             int32_t colour_count, int32_t choices, int32_t threads, std::string_view isa) {
   const Code* chosen = code(isa);
   if (!chosen) return wrong("this machine has no instruction set " + std::string(isa));
   if (std::string what = wrong_with(field, weights, pose); !what.empty()) return wrong(what);
-  auto crossings = t.dimensions();
-  if (crossings.size() != 2) return wrong("t must be a matrix");
-  size_t rays = crossings[0];
+  if (t.dimensions().size() < 2) return wrong("t must be a matrix");
+  size_t crossings = t.dimensions().back(), rays = t.element_count() / std::max<size_t>(crossings, 1);
   for (size_t count : {origin.element_count() / 3, direction.element_count() / 3, rgb.element_count() / 3,
                        range.element_count(), range_sigma.element_count(), limit.element_count(), weight.element_count(),
                        status.element_count(), rgb_valid.element_count(), range_valid.element_count()})
     if (count != rays) return wrong("t has " + std::to_string(rays) + " rays, other data " + std::to_string(count));
   int64_t particles = weights.dimensions()[0], size = weights.dimensions()[1];
+  if (choices < 1 || rays % choices || particles % choices)
+    return wrong(std::to_string(choices) + " choices of pixels divide " + std::to_string(rays) + " rays and " +
+                 std::to_string(particles) + " particles with a remainder");
   PixelModel model{mask_error, outlier, outlier_span, wall_sigma, colour_sigma, per_density};
-  View view{int(crossings[0]), int(crossings[1]), colour_count, origin.typed_data(), direction.typed_data(),
-            t.typed_data(), rgb.typed_data(), range.typed_data(), range_sigma.typed_data(), limit.typed_data(),
-            weight.typed_data(), status.typed_data(), rgb_valid.typed_data(), range_valid.typed_data()};
+  std::vector<View> views;
+  for (size_t each = rays / choices, at = 0; views.size() < size_t(choices); at += each)
+    views.push_back({int(each), int(crossings), colour_count, origin.typed_data() + 3 * at,
+                     direction.typed_data() + 3 * at, t.typed_data() + crossings * at, rgb.typed_data() + 3 * at,
+                     range.typed_data() + at, range_sigma.typed_data() + at, limit.typed_data() + at,
+                     weight.typed_data() + at, status.typed_data() + at, rgb_valid.typed_data() + at,
+                     range_valid.typed_data() + at});
   // Each particle belongs to one thread, so the result does not depend on the number of threads. If there are too few
   // particles, each is split into parts with separate sums, so that all threads get the same number of parts.
   int workers = std::max(threads, 1);
@@ -139,10 +145,15 @@ static ffi::Error view_terms(F32 weights, F32 pose, F32 origin, F32 direction, F
   }
   int count = int(std::max<int64_t>(1, std::min<int64_t>(workers, items)));
   auto work = [&](int i, float* memory) {
-    int64_t begin = items * i / count, end = items * (i + 1) / count;
-    chosen->run_view(field, model, view, all.data() + begin, int(end - begin), memory);
+    int64_t begin = items * i / count, end = items * (i + 1) / count, block = items / choices;
+    for (int64_t next; begin < end; begin = next) {  // the particles of one block look at one choice of pixels
+      next = std::min(end, (begin / block + 1) * block);
+      chosen->run_view(field, model, views[begin / block], all.data() + begin, int(next - begin), memory);
+    }
   };
-  bool done = on_threads(count, chosen->view_floats(field, model, view), work);
+  int64_t floats = 0;
+  for (const View& view : views) floats = std::max(floats, chosen->view_floats(field, model, view));
+  bool done = on_threads(count, floats, work);
   for (int64_t p = 0; p < particles && parts > 1; ++p) {
     float* first = sums.data() + p * parts * row;
     for (int64_t i = 1; i < parts; ++i)
@@ -185,7 +196,7 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(FarsideViewTerms, view_terms,
                                   .Attr<FieldSizes>("field")
                                   .Attr<float>("mask_error").Attr<float>("outlier")
                                   .Attr<float>("outlier_span").Attr<float>("wall_sigma").Attr<float>("colour_sigma")
-                                  .Attr<float>("per_density").Attr<int32_t>("colour_count")
+                                  .Attr<float>("per_density").Attr<int32_t>("colour_count").Attr<int32_t>("choices")
                                   .Attr<int32_t>("threads").Attr<std::string_view>("isa"));
 
 XLA_FFI_DEFINE_HANDLER_SYMBOL(FarsideDensity, density,

@@ -75,9 +75,11 @@ map_with_gradient.defvjp(_map_forward, _map_backward)
 
 
 def log_likelihood(
-    args: tuple[Model, Likelihood, Observation, Float[Array, "n m"]], positions: Float[Array, "p d"]
+    args: tuple[Model, Likelihood, Observation, Float[Array, "... n m"]], positions: Float[Array, "p d"]
 ) -> Float[Array, "p"]:
     """Batched log-likelihood for the samplers; differentiable in `positions` only.
+
+    Where the observation has k choices of pixels, each p / k positions in a row are given another choice, in order.
 
     If the kernel was built, it evaluates an `MLPField`, with the particles distributed over threads. Otherwise they are
     distributed over JAX's devices if their number is divisible. JAX evaluates one particle at a time per device, so a
@@ -106,24 +108,27 @@ def _row(pose: Pose | None, offset: Float[Array, ""]) -> Float[Array, "6"]:
 
 
 def plain_log_likelihood(
-    args: tuple[Model, Likelihood, Observation, Float[Array, "n m"]], positions: Float[Array, "p d"]
+    args: tuple[Model, Likelihood, Observation, Float[Array, "... n m"]], positions: Float[Array, "p d"]
 ) -> Float[Array, "p"]:
     """`log_likelihood` in JAX only: the kernel's reference, and its replacement if there is no kernel."""
 
-    def mapped(args, positions):
+    def mapped(args, choice, positions):
         # decode as one batch: one by one, each particle would read all of the hypernetwork's weights from memory
         decoded = jax.vmap(args[0].decode)(positions[:, : args[0].latent])
-        return map_with_gradient(_one_particle, None, args, None, (positions, decoded))
+        return map_with_gradient(_one_particle, None, args, choice, (positions, decoded))
 
-    devices = jax.devices()
-    if len(devices) == 1 or positions.shape[0] % len(devices):
-        return mapped(args, positions)
+    devices, count = jax.devices(), positions.shape[0]
+    choice = jnp.arange(count) // (count // args[2].choices)
+    if len(devices) == 1 or count % len(devices):
+        return mapped(args, choice, positions)
     mesh = jax.sharding.Mesh(np.array(devices), ("particles",))
     whole, split = jax.sharding.PartitionSpec(), jax.sharding.PartitionSpec("particles")
-    shared = jax.shard_map(mapped, mesh=mesh, in_specs=(whole, split), out_specs=split, check_vma=False)
-    return shared(args, positions)
+    shared = jax.shard_map(mapped, mesh=mesh, in_specs=(whole, split, split), out_specs=split, check_vma=False)
+    return shared(args, choice, positions)
 
 
-def _one_particle(args, _, particle):
+def _one_particle(args, choice, particle):
     model, likelihood, observation, t = args
+    if t.ndim > 2:
+        observation, t = observation.chosen(choice), t[choice]
     return log_likelihood_one(model, likelihood, observation, t, *particle)

@@ -24,15 +24,16 @@ def view_terms(
     field: MLPField,
     likelihood: Likelihood,
     observation: Observation,
-    t: Float[Array, "n m"],
+    t: Float[Array, "... n m"],
     weights: Float[Array, "p w"],
     pose: Float[Array, "p 6"],
-    pixel_weight: Float[Array, "n"] | None = None,
+    pixel_weight: Float[Array, "... n"] | None = None,
 ) -> Float[Array, "p"]:
     """Sum of w_i log p(pixel i | weights_p, pose_p) for each particle, differentiable in `weights` and `pose`.
 
     `pose` is yaw, x, y, log-scale, z and the common offset of all ranges. w is `pixel_weight`, or 1. The likelihood's
-    `power` is not applied. Without differentiation, only the forward pass runs.
+    `power` is not applied. Without differentiation, only the forward pass runs. Where the observation has several
+    choices of pixels, the particles are divided among them in blocks of equal size.
     """
     return call(field, likelihood, observation, t, weights, pose, pixel_weight, gradients=False)[0]
 
@@ -41,10 +42,10 @@ def call(
     field: MLPField,
     likelihood: Likelihood,
     observation: Observation,
-    t: Float[Array, "n m"],
+    t: Float[Array, "... n m"],
     weights: Float[Array, "p w"],
     pose: Float[Array, "p 6"],
-    pixel_weight: Float[Array, "n"] | None = None,
+    pixel_weight: Float[Array, "... n"] | None = None,
     threads: int | None = None,
     isa: str = "",
     gradients: bool = True,
@@ -58,7 +59,7 @@ def call(
     shapes = [(p,), (gradients * p, w), (gradients * p, 6)]
     operation = jax.ffi.ffi_call(VIEW_TERMS, [jax.ShapeDtypeStruct(s, jnp.float32) for s in shapes])
     flags = [a.astype(jnp.int32) for a in (observation.status, observation.rgb_valid, observation.range_valid)]
-    weight = jnp.ones(t.shape[0]) if pixel_weight is None else pixel_weight
+    weight = jnp.ones(t.shape[:-1]) if pixel_weight is None else pixel_weight
     pixels = (observation.rgb, observation.range, observation.range_sigma, observation.limit, weight)
     numbers = {
         "mask_error": likelihood.mask_error,
@@ -74,6 +75,7 @@ def call(
         *flags,
         **{name: np.float32(value) for name, value in numbers.items()},
         colour_count=np.int32(observation.colour_count),
+        choices=np.int32(observation.choices),
         **_how(field, threads, isa),
     )
     return values, g_weights, g_pose

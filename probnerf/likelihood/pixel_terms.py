@@ -17,7 +17,7 @@ from probnerf.types import Observation, Pose
 
 
 @program(rehearse=False)
-def faces_of_view(observation: Observation, likelihood: Likelihood) -> Float[Array, "n m"]:
+def faces_of_view(observation: Observation, likelihood: Likelihood) -> Float[Array, "... n m"]:
     """Crossings of every ray that can affect its pixel. They are constants of the observation, computed once per view.
 
     For FREE and UNKNOWN rays, crossings beyond the limit are dropped. This is exact. For OBJECT rays, crossings more
@@ -25,10 +25,11 @@ def faces_of_view(observation: Observation, likelihood: Likelihood) -> Float[Arr
     range only as a depth outlier, and now counts as a mask error instead. Apart from colour, both have the same
     likelihood if the outlier and mask error rates are equal.
     """
-    t = foam.crossings(observation.rays, likelihood.lattice)
+    rays = jax.tree.map(lambda a: a.reshape(-1, 3), observation.rays)
+    t = foam.crossings(rays, likelihood.lattice).reshape(*observation.status.shape, -1)
     behind = jnp.where(observation.range_valid, observation.range + likelihood.reach, jnp.inf)
     end = jnp.where(observation.status == OBJECT, behind, observation.limit)
-    return jnp.where(t <= end[:, None], t, foam.FAR)
+    return jnp.where(t <= end[..., None], t, foam.FAR)
 
 
 def _where_crossed(

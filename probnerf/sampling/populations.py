@@ -6,7 +6,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from probnerf.sampling.hmc import HMCState, split_r_hat
 from probnerf.types import Diagnostics, Posterior, StopReason, on_device
@@ -122,6 +122,23 @@ def from_draws(
     )
 
 
+def with_log_likelihoods(posterior: Posterior, values: Float[np.ndarray, "s"]) -> Posterior:
+    """The posterior with these log-likelihoods of its samples, and their R-hat."""
+    population = np.asarray(posterior.population)
+    r_hat = _r_hat(values, population, np.asarray(posterior.log_weights) > -np.inf)
+    return replace(
+        posterior,
+        log_likelihoods=on_device(values),
+        diagnostics=replace(posterior.diagnostics, r_hat=on_device(r_hat)),
+    )
+
+
+def _r_hat(values: Float[np.ndarray, "s"], population: Int[np.ndarray, "s"], weighed: Bool[np.ndarray, "s"]) -> float:
+    """Split R-hat over the populations that have weight."""
+    names = np.unique(population[weighed])
+    return split_r_hat(np.stack([values[population == name] for name in names]))
+
+
 def pooled(posteriors: Sequence[Posterior], evidence_power: float) -> Posterior:
     """Combine independent tempered SMC runs into one posterior with all their populations.
 
@@ -137,7 +154,6 @@ def pooled(posteriors: Sequence[Posterior], evidence_power: float) -> Posterior:
     values = np.concatenate([np.asarray(p.log_likelihoods) for p in posteriors])
     log_weights = share[population] - np.log(len(values) / len(estimates))
     spread = np.std(np.exp(estimates - log_evidence), ddof=1) / np.sqrt(len(estimates))
-    by_population = values[np.argsort(population, kind="stable")].reshape(len(estimates), -1)
     every = [p.diagnostics for p in posteriors]
 
     def summed(counts: Sequence[Array]) -> Array:
@@ -158,7 +174,7 @@ def pooled(posteriors: Sequence[Posterior], evidence_power: float) -> Posterior:
         diagnostics=replace(
             every[-1],
             divergences=summed([d.divergences for d in every]),
-            r_hat=jax.device_put(np.float32(split_r_hat(by_population[share > -np.inf]))),
+            r_hat=on_device(_r_hat(values, population, log_weights > -np.inf)),
             ess=jax.device_put(np.float32(1.0 / np.sum(np.exp(2.0 * log_weights)))),
             ancestors=summed([d.ancestors for d in every]),
             stages=summed([d.stages for d in every]),

@@ -59,7 +59,7 @@ def test_shapes_are_those_that_are_published(vessel):
     posterior = weighted_posterior(positions, np.ones(8), 0.0)
     config = question.config
     seen = np.zeros((config.grid,) * 3, bool)  # else measured surface is in all that appear
-    view = ConditionedView(vessel.frame, vessel.segment, observation, cube, seen)
+    view = ConditionedView(vessel.frame, vessel.segment, (observation,), cube, seen)
     h = published(view, posterior, likelihood, question.prior, config, 0)
     assert len(h.weights) == 8  # all of them, in their order
     asked = jnp.asarray(answered_voxels(vessel.frame, vessel.segment, cube, config.grid))

@@ -38,7 +38,7 @@ def test_what_is_called_free_at_a_risk() -> None:
 def test_rivals_answers_outlast_a_change_of_the_sampler_and_are_shown_beside_the_new_ones_alone() -> None:
     config, rivals = ControllerConfig(), RivalConfig()
     before = _settings(config, rivals, False)
-    other_sampler = _settings(replace(config, tolerance=0.5), rivals, False)
+    other_sampler = _settings(replace(config, runs=2), rivals, False)
     assert [m for m in METHODS if before[m] != other_sampler[m]] == [POSTERIOR]
     other_pixels = _settings(replace(config, infer=replace(config.infer, wall_sigma=0.1)), rivals, False)
     assert all(before[m] != other_pixels[m] for m in METHODS)

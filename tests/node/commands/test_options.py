@@ -33,7 +33,7 @@ def test_nested_settings_are_listed_on_request_alone(capsys: pytest.CaptureFixtu
         assert ended.value.code == 0
         text[option] = capsys.readouterr().out
     assert "--controller" not in text["--help"] and "--help-all" in text["--help"]
-    assert "--controller.tolerance" in text["--help-all"] and "--seed" in text["--help-all"]
+    assert "--controller.runs" in text["--help-all"] and "--seed" in text["--help-all"]
 
 
 def test_help_and_mistyped_options_load_nothing_heavy() -> None:

@@ -1,8 +1,7 @@
-"""The controller: what makes the model grow, what stops it, and that a cut leaves the answer before it standing."""
+"""The controller: how many runs are made, what stops them, and that a cut leaves the answer before it standing."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from math import inf
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ CONFIG = ControllerConfig(
     hypotheses=8,
     first_hypotheses=4,
     grid=32,
-    runs=4,
 )
 
 
@@ -38,8 +36,8 @@ def answers_of(config: ControllerConfig, stages: int | None = None) -> tuple[Est
 
 
 @pytest.mark.slow
-def test_where_little_is_asked_one_run_is_all() -> None:
-    found, answers = answers_of(replace(CONFIG, unexplained=1.0, tolerance=inf))
+def test_one_run_is_the_answer() -> None:
+    found, answers = answers_of(CONFIG)
     assert len(found.log) == 1 and found.log[0].startswith("2 x 10 particles: expected loss")
     assert found.hypotheses is answers[-1] and found.hypotheses.result == "converged"
     assert all(h.result == "underway" for h in answers[:-1]) and len(answers[0].weights) == CONFIG.first_hypotheses
@@ -49,12 +47,10 @@ def test_where_little_is_asked_one_run_is_all() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("limits", [{"unexplained": 0.0, "tolerance": inf}, {"unexplained": 1.0, "tolerance": 0.0}])
-def test_unexplained_pixels_take_all_runs_and_so_does_error(limits: dict[str, float]) -> None:
-    small, _ = answers_of(replace(CONFIG, unexplained=1.0, tolerance=inf))
-    found, answers = answers_of(replace(CONFIG, **limits))
-    assert [line.split(": expected loss")[0] for line in found.log] == ["2 x 10 particles", "8 x 10 particles"]
-    assert found.log[0].endswith("-> 8 x 10 particles") and "->" not in found.log[1]
+def test_four_runs_answer_together() -> None:
+    small, _ = answers_of(CONFIG)
+    found, answers = answers_of(replace(CONFIG, runs=4))
+    assert [line.split(": expected loss")[0] for line in found.log] == [f"{2 * k} x 10 particles" for k in (1, 2, 3, 4)]
     h = found.hypotheses
     assert h.result == "converged" and len(np.unique(h.population)) + h.diagnostics.failed_populations == 8
     assert found.posterior.positions.shape[0] == 80
@@ -62,13 +58,13 @@ def test_unexplained_pixels_take_all_runs_and_so_does_error(limits: dict[str, fl
     assert float(np.exp(np.asarray(found.posterior.log_weights, np.float64)).sum()) == pytest.approx(1.0, abs=1e-4)
     # the first run's answer came in full, and after it none that was underway but whole ones
     full = [len(h.weights) == CONFIG.hypotheses for h in answers]
-    assert full[full.index(True) :] == [True] * 2
+    assert full[full.index(True) :] == [True] * 4
 
 
 @pytest.mark.slow
 def test_a_cut_leaves_the_runs_before_it_and_repeats_bit_for_bit() -> None:
-    config = replace(CONFIG, tolerance=0.0)
-    small, _ = answers_of(replace(CONFIG, unexplained=1.0, tolerance=inf))
+    config = replace(CONFIG, runs=4)
+    small, _ = answers_of(CONFIG)
     stages = small.hypotheses.stage + 2
     found, _ = answers_of(config, stages)
     assert found.hypotheses.result == found.posterior.result == "stages" and found.hypotheses.stage == stages
@@ -82,12 +78,12 @@ def test_a_cut_leaves_the_runs_before_it_and_repeats_bit_for_bit() -> None:
 
 @pytest.mark.slow
 def test_a_cut_between_later_runs_keeps_all_that_are_whole() -> None:
-    config = replace(CONFIG, tolerance=0.0)
-    each = [answers_of(replace(config, runs=runs))[0].hypotheses.stage for runs in (2, 3)]
+    config = replace(CONFIG, runs=4)
+    each = [answers_of(replace(CONFIG, runs=runs))[0].hypotheses.stage for runs in (2, 3)]
     found, _ = answers_of(config, (each[0] + each[1]) // 2)
     assert found.hypotheses.result == "stages" and found.posterior.positions.shape[0] == 40
     assert len(np.unique(found.hypotheses.population)) + found.hypotheses.diagnostics.failed_populations == 4
-    assert found.log[1].startswith("4 x 10 particles: expected loss") and found.log[2] == "no room for more (stages)"
+    assert found.log[1].startswith("4 x 10 particles: expected loss") and found.log[-1] == "no room for more (stages)"
 
 
 def test_no_runs_are_refused() -> None:

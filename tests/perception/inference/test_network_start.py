@@ -80,7 +80,7 @@ def test_the_guess_is_the_first_answer_and_tempering_begins_at_the_network(prior
     np.testing.assert_allclose(two.sum(), (1.0 - unexplained) / 5)
     # what goes on from there does not begin at the network, and keeps what it says
     h = found.hypotheses
-    view = ConditionedView(frame_from(0.0), segment(frame_from(0.0))[0], found.observation, h.object_frame, h.seen)
+    view = ConditionedView(frame_from(0.0), segment(frame_from(0.0))[0], (found.observation,), h.object_frame, h.seen)
     goes_on = ViewSampler(view, prior, CONFIG.infer, 1, NO_LIMITS, before=found.posterior)
     assert goes_on.kinds == h.kinds != {} and not goes_on.asks_network
     assert goes_on.start == "the samples of an earlier run"

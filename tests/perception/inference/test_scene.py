@@ -57,7 +57,7 @@ class Inference:
     def begin(self) -> None:
         self.diary.append(f"{self.name} begins")
 
-    def step(self, runs: int | None = None, deadline: float | None = None) -> bool:
+    def step(self, deadline: float | None = None) -> bool:
         ends = min(t for t in (deadline, self.end, math.inf) if t is not None)
         cost = (
             self.first_cost if self.first_cost and not any("runs" in d or "cut" in d for d in self.diary) else self.cost

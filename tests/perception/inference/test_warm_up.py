@@ -38,7 +38,7 @@ def _tracker(monkeypatch: pytest.MonkeyPatch, outcome: str | Exception, then: st
     asked: list = []
 
     def infer_look(self: Tracker, look: Any, limits: Limits, callbacks: Callbacks) -> Update:
-        asked.append((self, "infer", look._view.observation))
+        asked.append((self, "infer", look._view.every_choice))
         assert limits == Limits(stages=1) and callbacks.on_answer(None) is None
         monkeypatch.setitem(self.__dict__["_tracks"], 1, SimpleNamespace(posterior="its own"))
         return Update(Change.NEW, replace(body_with_handle(), result=StopReason(outcome)), 1, 0.0, 0.0)
@@ -48,7 +48,7 @@ def _tracker(monkeypatch: pytest.MonkeyPatch, outcome: str | Exception, then: st
         asked.append((self, "look", hidden, how is not None and how(1)[1]))
         if isinstance(outcome, Exception):
             raise outcome
-        return SimpleNamespace(object_id=1, _view=SimpleNamespace(observation=hidden))
+        return SimpleNamespace(object_id=1, _view=SimpleNamespace(every_choice=hidden))
 
     def infer(key: Any, model: Any, observation: Any, config: Any, *, before: Any, stages: int) -> Any:
         asked.append(("sample", observation, before))
