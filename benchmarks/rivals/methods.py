@@ -291,7 +291,8 @@ def settings_of(method: Method, config: ControllerConfig) -> Line:
     """A method's own settings, and a digest of all else that observation and inference were set to."""
     own = (*SAMPLERS, "modes", "network")  # of the sampler, which other methods do not have
     infer = {name: value for name, value in asdict(config.infer).items() if method.smc or name not in own}
-    shared = {"infer": infer, "observe": asdict(config.observe), "hypotheses": config.hypotheses}
+    observe = {name: value for name, value in asdict(config.observe).items() if method.smc or name != "choices"}
+    shared = {"infer": infer, "observe": observe, "hypotheses": config.hypotheses}
     return {**method.settings, "config": digest(shared)[:8]}
 
 

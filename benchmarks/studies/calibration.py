@@ -155,7 +155,9 @@ def _answered_by_all(lines: list[Line]) -> list[Line]:
 
 def _settings(config: ControllerConfig, rivals: RivalConfig, quick: bool) -> dict[str, Line]:
     """What each method's answers depend on. The rivals' outlast a change of the sampler."""
-    shared = [asdict(likelihood_settings(config.infer)), asdict(config.observe), config.grid, config.hypotheses]
+    observe = asdict(config.observe)
+    del observe["choices"]  # the rivals are given one
+    shared = [asdict(likelihood_settings(config.infer)), observe, config.grid, config.hypotheses]
 
     def told(*settings: object) -> Line:
         return {"digest": digest(settings, quick)}
