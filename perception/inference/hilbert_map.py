@@ -161,6 +161,8 @@ def _before(
     start, end = np.linalg.norm(middle) - config.radius, np.linalg.norm(middle) + config.radius
     steps = np.arange(start, end, config.ray_step)
     distance = steps + config.ray_step * rng.random((len(seen), len(steps)))
+    meets = np.linalg.norm(np.cross(seen, middle), axis=1) <= 1.001 * config.radius * length[:, 0]  # most rays do not
+    seen, length, distance = seen[meets], length[meets], distance[meets]
     points = distance[..., None] * (seen / length)[:, None]
     return points[(distance < length) & (np.linalg.norm(points - middle, axis=-1) <= config.radius)]
 
