@@ -94,6 +94,8 @@ def answers(
     points, occupied = hidden_points(seen, scene)
     begun = time.monotonic()
     try:
+        if not len(points):
+            raise ValueError("no point about it is hidden")
         inference = inference_of(seen.frame, segment(seen.frame, 1)[0], prior, config, seed=seed)
         inference.begin()
     except ValueError as error:

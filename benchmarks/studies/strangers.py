@@ -129,6 +129,8 @@ def _answers(
     seen = stranger(path, scene)
     points, occupied = hidden_points(seen, scene)
     try:
+        if not len(points):
+            raise ValueError("no point about it is hidden")
         found = segment(seen.frame, 1)[0]
     except ValueError as error:
         return {method: {"refused": str(error)} for method in (*ALWAYS, *_network_methods(prior))}

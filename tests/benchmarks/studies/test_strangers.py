@@ -71,6 +71,20 @@ def test_older_rows_are_compared_on_the_same_points_only(tmp_path: Path) -> None
         summary(rows(), options)
 
 
+def test_an_object_that_hides_nothing_is_left_out_by_all_methods(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "meshes" / "bullet3").mkdir(parents=True)
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "meshes" / "bullet3" / "mug.obj")
+    nothing = np.zeros((0, 3)), np.zeros(0, bool)
+    monkeypatch.setattr("benchmarks.studies.strangers.hidden_points", lambda *_: nothing)
+    options = Options(tmp_path, set="bullet", data=tmp_path, results=tmp_path / "rows.jsonl")
+    with pytest.raises(ValueError, match="no results"):
+        main(options)
+    kept = Results(options.results).lines
+    assert {each["method"]: each["refused"] for each in kept} == dict.fromkeys(METHODS, "no point about it is hidden")
+
+
 @pytest.mark.slow
 def test_an_object_goes_from_mesh_to_rows_once(tmp_path: Path) -> None:
     folder = tmp_path / "meshes" / "bullet3"
