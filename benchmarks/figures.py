@@ -60,8 +60,8 @@ these changes moved answers:
 - 0812815 (2026-11-25): populations that failed are left out. It changes few answers about objects in full sight.
 - 84c28aa (2026-11-25): `out_of_model` is raised below 0.90 of the pixels explained, not below 0.88.
 - 3970cc1 (2026-11-28): the shipped prior's decoder learnt on at points of others. Before, the prior was 3705a6d9.
-- 8919b3d (2026-11-29): each population compares its own choice of pixels, and one run is made; before, up to four of the
-  same pixels. What is not explained is asked of all of them.
+- 8919b3d (2026-11-29): each population compares its own choice of pixels, and one run is made; before, up to four of
+  the same pixels. What is not explained is asked of all of them.
 """
 
 
