@@ -1,18 +1,16 @@
 """Rays in the cube agree with the cylinder that the picture was made of; what was not seen says nothing."""
 
 from dataclasses import replace
-from itertools import combinations, pairwise
+from itertools import pairwise
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
-from scipy import ndimage
 
 from perception.inference.controller import estimate
 from perception.inference.settings import ControllerConfig
 from perception.observation.object_frame import ObjectFrame, object_frame
-from perception.observation.rays import calibration_widths, observations, observe
+from perception.observation.rays import calibration_widths, observe
 from perception.observation.segmentation import Segment, segment
 from perception.observation.settings import ObserveConfig
 from perception.observation.visibility import inside_view, seen_voxels
@@ -181,37 +179,6 @@ def test_rays_repeat_with_the_seed_and_cover_the_object() -> None:
 
     share = cells(pixels[:, 0], pixels[:, 1]) / len(pixels)
     np.testing.assert_allclose(cells(px[:, 1], px[:, 0]) / CONFIG.colour_rays, share, atol=0.03)
-
-
-def test_each_choice_is_of_other_pixels_and_the_first_is_the_one_of_observe() -> None:
-    frame, found, first, cube, _ = seen(CAN)
-    every, own = observations(frame, found, replace(CONFIG, choices=3))
-    assert len(every) == 3 and own.half_extent == cube.half_extent
-    jax.tree.map(np.testing.assert_array_equal, every[0], first)
-    directions = [np.asarray(o.rays.direction) for o in every]
-    for one, other in combinations(directions, 2):
-        same = (one[:, None] == other).all(axis=-1).any(axis=1)
-        assert same.mean() < 0.2
-    for one, o in zip(directions, every, strict=True):
-        told = np.asarray(o.status) != UNKNOWN
-        assert told.sum() == CONFIG.colour_rays + CONFIG.free_rays
-        assert len(np.unique(one[told], axis=0)) == told.sum()  # no pixel counts twice
-    with pytest.raises(ValueError, match="choices is 0"):
-        ObserveConfig(choices=0)
-
-
-def test_few_pixels_are_all_taken_once() -> None:
-    """More free rays than there are free pixels near the outline, and than there are at all."""
-    frame, found, _, _, _ = seen(CAN)
-    away = np.where(found.status == FREE, ndimage.distance_transform_edt(~found.mask), np.inf)
-    beside = np.unravel_index(np.argsort(away, axis=None)[:40], away.shape)
-    status = np.where(found.status == FREE, UNKNOWN, found.status)
-    status[beside] = FREE
-    few = replace(found, status=status, occluder=np.zeros_like(found.occluder))
-    for observation in observations(frame, few, replace(CONFIG, choices=3))[0]:
-        free = np.asarray(observation.status) == FREE
-        directions = np.asarray(observation.rays.direction)[free]
-        assert len(np.unique(directions, axis=0)) == free.sum() == 40
 
 
 def test_colour_is_of_the_pixel() -> None:
