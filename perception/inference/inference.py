@@ -5,7 +5,7 @@ these are the last one. Else sampling begins there.
 
 A run is a small sampler: a few independent populations of a few particles, each of which compares its own choice of the
 view's pixels. Without a network, they begin where climbs from the encoder's guesses end. One run is the answer: with
-more, whose populations are pooled, no score was better on any object tried (`farside bench runs`), whatever the
+more, whose populations are pooled, the mean score of 23 scans was the same (`farside bench runs`), whatever the
 populations' disagreement about unseen space says that they are expected to gain (`publish.expected_loss`). An answer
 can be published from the start, and a better one after each step.
 

@@ -118,7 +118,9 @@ def plain_log_likelihood(
         return map_with_gradient(_one_particle, None, args, choice, (positions, decoded))
 
     devices, count = jax.devices(), positions.shape[0]
-    choice = jnp.arange(count) // (count // args[2].choices)
+    if count % args[2].choices:
+        raise ValueError(f"{args[2].choices} choices of pixels do not divide {count} positions")
+    choice = jnp.arange(count) // max(count // args[2].choices, 1)
     if len(devices) == 1 or count % len(devices):
         return mapped(args, choice, positions)
     mesh = jax.sharding.Mesh(np.array(devices), ("particles",))

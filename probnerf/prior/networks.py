@@ -68,7 +68,7 @@ _HOUSEHOLD = Preset(
     fitted=True,
     smooth=True,
     pairs=4,
-    explains=0.61,  # of 108 things to choose by; to those below 0.67, caution cost score (`farside bench strangers`)
+    explains=0.61,  # of 108 things to choose by: household validation objects and scans (`farside bench strangers`)
     wall_sigma=0.1,  # chosen by the scans' scores (`farside bench strangers`)
 )
 PRESETS = {

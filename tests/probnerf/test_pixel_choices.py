@@ -58,6 +58,12 @@ def test_each_block_of_positions_is_given_its_own_choice(function) -> None:
         np.testing.assert_allclose(gradient[block], alone[1], rtol=1e-5, atol=1e-5 * np.abs(alone[1]).max())
 
 
+def test_positions_that_choices_do_not_divide_are_refused() -> None:
+    args = args_of(stacked([view(9, 5, seed) for seed in range(3)]))
+    with pytest.raises(ValueError, match="3 choices of pixels do not divide 4 positions"):
+        plain_log_likelihood(args, np.zeros((4, args[1].dim(MODEL)), np.float32))
+
+
 def test_what_a_view_costs_is_the_same_for_each_choice() -> None:
     each = [view(9, 5, seed) for seed in range(3)]
     likelihood = likelihood_settings(CONFIG)
