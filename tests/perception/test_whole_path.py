@@ -69,9 +69,11 @@ def _each(args, positions):
     return jax.vmap(lambda q: log_likelihood_one(model, likelihood, observation, t, q))(positions)
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize(("degrees", "seeds"), [(180.0, 8), (60.0, 3)])  # where it is hidden, an answer errs by 0.1
+@pytest.mark.parametrize(
+    ("degrees", "seeds"),  # where it is hidden, an answer errs by 0.1
+    [pytest.param(180.0, 8, marks=pytest.mark.slow), pytest.param(60.0, 3, marks=pytest.mark.nightly)],
+)
 def test_a_handle_s_angle_and_the_space_behind_are_what_brute_force_says(degrees: float, seeds: int) -> None:
     frame = frame_of(np.deg2rad(degrees))
     seen = segment(frame, 1)[0]

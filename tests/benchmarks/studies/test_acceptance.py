@@ -62,7 +62,7 @@ def test_a_position_may_have_delta(seen) -> None:
     np.testing.assert_allclose(moved - plain, 0.025, atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_acceptance_falls_with_the_step_for_every_renderer() -> None:
     model = load_prior(TABLETOP).model
     z_tilde, rays = jax.random.normal(jax.random.key(5), (model.latent,)), view_rays(5, 48)

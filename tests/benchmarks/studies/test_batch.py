@@ -42,7 +42,7 @@ def test_rates_stand_beside_the_first_and_the_plain_loop(tmp_path: Path, monkeyp
     assert summary.tables[0].lines[0] == ["plain loop", "4", "80", "1.33", "1.00"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_batch_is_measured(tmp_path: Path) -> None:
     rows = {(row.condition, row.metric): row.value for row in main(Options(tmp_path, quick=True)).rows}
     loop, one, two = (rows[by, "units_per_hour"] for by in ("plain loop", "1 workers", "2 workers"))

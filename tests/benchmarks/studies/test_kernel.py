@@ -16,7 +16,7 @@ def test_the_networks_sizes_are_their_weights_without_biases() -> None:
     assert kernel._density_size(field) + kernel._colour_size(field) == field.size - biases - direction
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_rows_and_a_picture_come_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernel, "SIDE", 64)
     if not library.available():

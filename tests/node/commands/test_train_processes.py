@@ -85,9 +85,10 @@ def test_two_processes_with_half_a_batch_each_make_the_steps_of_one(alone: Path,
     assert (two / "learnt.json").read_text() == (alone / "learnt.json").read_text()
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(1800)  # six processes compile
-@pytest.mark.parametrize("victim", [0, 1])
+@pytest.mark.parametrize(
+    "victim", [pytest.param(0, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.nightly)]
+)
 def test_a_killed_process_ends_the_other_and_the_run_goes_on(two: Path, tmp_path: Path, victim: int) -> None:
     shutil.copytree(two / "shapes", tmp_path / "shapes")
     processes, history = start_two(tmp_path), tmp_path / "history.jsonl"

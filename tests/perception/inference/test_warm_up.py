@@ -145,7 +145,7 @@ def test_nothing_large_is_left_for_the_first_frame_to_compile(
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_without_the_kernel_a_rehearsal_finds_the_sizes_of_its_view(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

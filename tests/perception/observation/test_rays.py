@@ -314,7 +314,7 @@ def test_a_wrong_focal_length_errs_as_the_widths_say() -> None:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(1200)
 def test_a_worse_calibration_gives_a_less_certain_posterior() -> None:
     """Eight answers of four whole runs each: one answer's spread of the size moves by a factor of two with chance."""

@@ -79,7 +79,7 @@ def exact(pictures: PictureSet, shown: np.ndarray) -> tuple[np.ndarray, ...]:
     return yaw, pose, z + stats.norm.logpdf(pictures.mean[:, 2]), kind
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_trained_network_is_the_exact_posterior(tmp_path: Path) -> None:
     """The divergence from the exact posterior is small in each part, and ranks of the truth among draws are uniform."""
     sizes = replace(SIZES, channels=32, context=64, trunk=64, condition=32, couplings=4, hidden=64, yaw_components=8)
