@@ -30,7 +30,7 @@ from functools import cache
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 from matplotlib.figure import Figure
 
 from benchmarks.harness.progress import say
@@ -41,24 +41,31 @@ from benchmarks.harness.tables import Table, gated
 from benchmarks.measures.metrics import coverage, ks_distance, randomised_rank, uniform_band
 from probnerf.fields.base import Model
 from probnerf.fields.cylinder import CylinderModel
+from probnerf.geometry import look_at, pinhole_rays
 from probnerf.inference import likelihood_of, likelihood_settings, suited
 from probnerf.likelihood.dispatch import log_likelihood
 from probnerf.likelihood.pixel_terms import faces_of_view
 from probnerf.likelihood.position import pose_of
 from probnerf.likelihood.settings import Likelihood
+from probnerf.network_start import defensive, picture_density
 from probnerf.objects.cylinder_scenes import draw_pixels, grid_of_rays
-from probnerf.prior.checkpoint import load_prior
+from probnerf.pixel_status import OBJECT
+from probnerf.prior.checkpoint import Prior, load_prior
+from probnerf.prior.encoder_input import ENCODER_RADIUS
 from probnerf.prior.networks import PRESETS, ProbNeRF
+from probnerf.prior.posterior_network import EncoderPicture
 from probnerf.rendering.occupancy import solid, voxel_centres
+from probnerf.sampling.defensive_mixture import DefensiveMixture
 from probnerf.sampling.populations import thin
 from probnerf.sampling.tempered_smc import tempered_smc
-from probnerf.settings import InferConfig, TemperedSMCConfig
+from probnerf.settings import InferConfig, NetworkConfig, TemperedSMCConfig
 from probnerf.shapes import opacity_grids
-from probnerf.types import POSE_SIZE, Posterior
+from probnerf.types import POSE_SIZE, Observation, Posterior, Rays
 
 GRID = 24
 POSE_SIGMA = (0.08, 0.08, 0.06, 0.02, 0.03)  # of perception's usual widths, cube units
 STATISTICS = ("volume", "hidden", "voxel", "yaw", "delta", "log_likelihood")
+TABLE = 0.6  # colour of the table in the network's picture
 DRAWS = 64  # posterior samples that ranks are taken among
 
 
@@ -74,11 +81,16 @@ class Condition:
     columns: int = 6  # pixels: columns x rows
     rows: int = 5
     lattice: int = 12
+    network: bool = False  # begin at the prior's posterior network, which is shown a picture of the same truth
 
 
 @cache
+def _shipped() -> Prior:
+    return load_prior(None)
+
+
 def _prior() -> Model:
-    return load_prior(None).model
+    return _shipped().model
 
 
 @cache
@@ -86,13 +98,14 @@ def _tiny() -> Model:
     return ProbNeRF(PRESETS["tiny"], jax.random.key(0))
 
 
-def _on_prior(name: str, sampler: TemperedSMCConfig, pose: bool = True) -> Condition:
-    return Condition(name, _prior, sampler, pose, columns=8, rows=8, lattice=32)
+def _on_prior(name: str, sampler: TemperedSMCConfig, pose: bool = True, network: bool = False) -> Condition:
+    return Condition(name, _prior, sampler, pose, columns=8, rows=8, lattice=32, network=network)
 
 
 THOROUGH = TemperedSMCConfig(populations=2, particles=96, start_particles=768, moves=4, final_stages=2, keep=2)
 LARGE = TemperedSMCConfig(populations=4, particles=256, start_particles=1024)
 QUICK = replace(InferConfig().smc_from_prior, evidence_power=1.0)  # what ships, but for its starts, runs and weights
+NETWORK = TemperedSMCConfig(populations=4, particles=64, start_particles=512, moves=2, final_stages=4, keep=4)
 CONDITIONS = (
     Condition("cylinder", CylinderModel, TemperedSMCConfig()),
     Condition("cylinder, pose known", CylinderModel, TemperedSMCConfig(), pose=False),
@@ -103,6 +116,9 @@ CONDITIONS = (
     _on_prior("shipped prior", THOROUGH),
     Condition("cylinder, quick sampler", CylinderModel, QUICK),
     _on_prior("shipped prior, quick sampler", QUICK),
+    _on_prior("begun at the network, pose known", NETWORK, pose=False, network=True),
+    _on_prior("begun at the network", NETWORK, network=True),
+    _on_prior("begun at the network, as it ships", InferConfig().smc_from_network, network=True),
 )
 
 
@@ -148,13 +164,49 @@ def ranks_of(condition: Condition, model: Model, seed: int) -> tuple[dict[str, f
     )
     likelihood = likelihood_of(_settings(condition), observation, sample_pose=condition.pose)
     args = (model, likelihood, observation, faces_of_view(observation, likelihood))
-    posterior = tempered_smc(jax.random.fold_in(key, 2), log_likelihood, args, dim, condition.sampler)
+    reference = _reference(condition, jax.random.fold_in(key, 3), model, drawn, truth, observation)
+    posterior = tempered_smc(
+        jax.random.fold_in(key, 2), log_likelihood, args, dim, condition.sampler, reference=reference
+    )
     chosen, weights, _ = thin(posterior, DRAWS)
     positions = jnp.concatenate([truth[None], posterior.positions[jnp.asarray(chosen)]])
     found = statistics(model, likelihood, positions, pose_sigma, int(rng.integers(2**31)))
     found["log_likelihood"] = np.asarray(_value(args, positions), np.float64)
     ranks = {name: randomised_rank(v[1:], weights, v[0], rng) for name, v in found.items()}
     return ranks, posterior
+
+
+def _reference(
+    condition: Condition,
+    key: PRNGKeyArray,
+    model: Model,
+    likelihood: Likelihood,
+    truth: Float[Array, "d"],
+    observation: Observation,
+) -> DefensiveMixture | None:
+    """The network's density, of a picture of the truth from where the pixels were seen; None: begin at the prior.
+
+    Whatever the network says, the target is the posterior given the pixels, so the law of the ranks holds.
+    """
+    if not condition.network:
+        return None
+    network = _shipped().network
+    assert network is not None, "the shipped prior has a posterior network"
+    size, camera = network.sizes.image_size, np.asarray(observation.rays.origin[0], np.float64)
+    tan_half = ENCODER_RADIUS / float(np.linalg.norm(camera))
+    T_object_camera = look_at(camera, np.zeros(3))
+    rays = Rays(*(jnp.asarray(a) for a in pinhole_rays(T_object_camera, 0.5 * size / tan_half, size)))
+    every, yes = jnp.ones(size * size, bool), jnp.asarray(True)
+    seen = draw_pixels(key, model, likelihood, truth, rays, every, yes, pose_sigma=observation.pose_sigma)
+    is_object = (seen.status == OBJECT).reshape(size, size)
+    picture = EncoderPicture(
+        rgb=jnp.where(is_object[..., None], jnp.clip(seen.rgb, 0.0, 1.0).reshape(size, size, 3), TABLE),
+        distance=jnp.where(is_object, seen.range.reshape(size, size), 0.0),
+        unknown=jnp.zeros((size, size)),
+        T_view_camera=jnp.asarray(T_object_camera, jnp.float32),
+        tan_half_fov=jnp.asarray(tan_half),
+    )
+    return defensive(picture_density(network, picture, observation, condition.pose), NetworkConfig())
 
 
 @jax.jit
@@ -165,6 +217,7 @@ def _value(args, positions):
 def identity(condition: Condition, prior: str) -> Line:
     """What makes a draw of this condition the same one, but for its number."""
     description = {"sampler": asdict(condition.sampler), "infer": asdict(_settings(condition)), "pose": condition.pose}
+    description |= {"network": True} if condition.network else {}
     description |= {"pixels": [condition.columns, condition.rows], "grid": GRID, "draws": DRAWS, "widths": POSE_SIGMA}
     settings = {"digest": digest(description)}
     same = {"method": "tempered_smc", "condition": condition.name, "settings": settings, "seed": 0}

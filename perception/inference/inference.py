@@ -211,7 +211,7 @@ class _Publisher:
     def publish_cut(self, runs: list[Posterior]) -> Hypotheses:
         """The answer of a run that a step's deadline ended: as many shapes, as coarse as early ones."""
         power, config = self.sampler.smc.evidence_power, self.config
-        return self._published(pooled(runs, power), replace(config, coarse=config.first_coarse), power)
+        return self._published(pooled(runs, power), replace(config, coarse=config.first_coarse), power, early=True)
 
     def publish_draws(self, draws: Posterior) -> Hypotheses:
         """The answer of weighed draws, whose weights are those of the posterior."""
@@ -262,19 +262,24 @@ class _Publisher:
         """An answer that is cheaper to make."""
         begun, config = time.monotonic(), self.config
         cheaper = replace(config, hypotheses=config.first_hypotheses, coarse=config.first_coarse)
-        answer = self._published(posterior, cheaper, self.sampler.smc.evidence_power)
+        answer = self._published(posterior, cheaper, self.sampler.smc.evidence_power, early=True)
         self.hand_out(answer)
         self._early_at = time.monotonic()
         self._early_s = self._early_at - begun
         return answer
 
     def _published(
-        self, posterior: Posterior, config: PublishConfig, evidence_power: float, guess: Posterior | None = None
+        self,
+        posterior: Posterior,
+        config: PublishConfig,
+        evidence_power: float,
+        guess: Posterior | None = None,
+        early: bool = False,
     ) -> Hypotheses:
         sampler = self.sampler
         with sampler.stopwatch.part("publishing"):
             h = published(
                 sampler.view, posterior, sampler.likelihood, sampler.prior, config, sampler.seed,
-                point_gradients=sampler.point_gradients, evidence_power=evidence_power, guess=guess,
+                point_gradients=sampler.point_gradients, evidence_power=evidence_power, guess=guess, early=early,
             )  # fmt: skip
         return replace(h, stage=max(sampler.stages, h.stage), kinds=sampler.kinds)

@@ -73,15 +73,17 @@ def published(
     point_gradients: float = float("nan"),
     evidence_power: float = float("nan"),
     guess: Posterior | None = None,
+    early: bool = False,
 ) -> Hypotheses:
     """The posterior as Hypotheses. With a network's `guess`, where pixels stay unexplained, draws of it are among them
     (`_hedged`), and shapes of a smooth map (`_beside_smooth`).
 
+    Of an `early` answer only one choice of pixels is asked what it leaves unexplained, which is cheaper.
     `point_gradients` and `evidence_power` become diagnostics of it.
     """
     chosen = _thinned(posterior, config.hypotheses)
     sizeless, pose_sigma = without_sizes(likelihood), view.observation.pose_sigma
-    pixels = view.every_pixel if config.coarse == 1 else view.observation  # an early answer is cheaper in this, too
+    pixels = view.observation if early else view.every_pixel
     each = explained(prior.model, sizeless, pixels, _padded(chosen[0], config.hypotheses))
     fit = float(chosen[1] @ np.asarray(each, np.float64)[: len(chosen[1])])
     smooth = 0
