@@ -203,7 +203,7 @@ def _tables(of: Figures) -> list[Table]:
 
 
 def _draw(lines: Sequence[Line]) -> Figure:
-    """ROC of both checks; and where the share that is explained lies, with the shipped bound."""
+    """ROC of both checks; and where the share that is explained lies, with the bound of the flag."""
     figure = Figure(figsize=(13, 4), layout="constrained")
     axes = figure.subplots(1, 3)
     by = {c: [line for line in lines if line["condition"] == c and "refused" not in line] for c in CONDITIONS}
@@ -221,7 +221,11 @@ def _draw(lines: Sequence[Line]) -> Figure:
     for condition, colour in {FAMILY: "tab:blue", **COLOURS}.items():
         values = [line["explained"] for line in by[condition]]
         axes[2].hist(values, bins, histtype="step", color=colour, label=condition, linewidth=1.5)
-    axes[2].axvline(ControllerConfig().out_of_model_below, color="k", linewidth=0.8, label="flagged below")
+    flagged, left = (
+        [x["explained"] for own in by.values() for x in own if x["flagged"] is is_so] for is_so in (True, False)
+    )
+    if flagged and left:  # each prior has its own bound, which lies between these
+        axes[2].axvline(0.5 * (max(flagged) + min(left)), color="k", linewidth=0.8, label="flagged below")
     axes[2].set(title="share of pixels explained", ylabel="objects")
     axes[2].legend(fontsize=8)
     return figure
