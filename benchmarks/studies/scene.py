@@ -4,8 +4,9 @@ Simulated scenes of the family's test objects (`benchmarks.scenes.crowded`), a d
 objects share one budget, which counts from before the masks are read. Unseen space is asked at points about each
 object, 5 mm or more behind what is seen there; every object has the same weight.
 
-Methods: the scene in rounds (first answers for all, a run each, then runs where unseen space may gain most) with a
-budget and with four times as much; and *one by one*, each with its tenth of the budget, as before there were rounds.
+Methods: the scene in rounds (first answers for all, a run each in its share of the time that is left, then again those
+that were cut, while there is room) with a budget and with four times as much, which ends when each has its run; and
+*one by one*, each with its tenth of the budget, as before there were rounds.
 A scene of another seed is inferred before, so that nothing is compiled within the time.
 
 - log_score: mean -log of the probability of a point's truth, nats, p clipped to 0.001 ... 0.999. gap: of the rounds,
