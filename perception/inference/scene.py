@@ -20,11 +20,11 @@ def estimate_scene(
     """Each segment's estimate as soon as it is done, or the reason why there is none.
 
     Without a `deadline` (of `time.monotonic`) one object is finished after the other. With one, all objects get their
-    first answers; then each a run of the sampler, in its share of the time that is left; then, as long as there is room,
-    runs that were cut are made anew, the object first whose unseen space may gain most (`Inference.loss`). At the end
-    every object has the best answer that there was time for. `start` makes an inference that ends at a time. `kept_back_s` is what the
-    caller spends on each answer. After Ctrl-C, also one that is thrown in, all present answers are given; where none of
-    them says so, KeyboardInterrupt is raised then.
+    first answers; then each a run of the sampler, in its share of the time that is left; then, as long as there is
+    room, runs that were cut are made anew, the object first whose unseen space may gain most (`Inference.loss`). At the
+    end every object has the best answer that there was time for. `start` makes an inference that ends at a time.
+    `kept_back_s` is what the caller spends on each answer. After Ctrl-C, also one that is thrown in, all present
+    answers are given; where none of them says so, KeyboardInterrupt is raised then.
     """
     if deadline is not None and len(segments) > 1:
         yield from _in_rounds(segments, start, deadline - kept_back_s * len(segments))
