@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
 from benchmarks.harness.rows import Row
 from benchmarks.rivals.methods import CONDITIONS, METHODS
@@ -57,6 +57,8 @@ def draw_frontier(rows: Sequence[Row]) -> Figure:
             for group in STYLE:
                 _draw_group(ax, value, condition, group, metric, cost)
             ax.set_xscale("log")
+            ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))  # also where an axis spans less than a decade
+            ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}") if cost == "seconds" else EngFormatter(sep=""))
             ax.xaxis.set_minor_formatter(NullFormatter())
             ax.margins(x=0.18, y=0.08)
             ax.grid(alpha=0.25)

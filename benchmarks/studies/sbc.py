@@ -303,7 +303,8 @@ def outside(ranks: Float[np.ndarray, "n"], level: float = 0.95) -> float:
 
 
 def _draw(found: dict[str, dict[str, np.ndarray]]) -> Figure:
-    """Each condition's rank distribution functions, less the uniform one, with the band."""
+    """Each condition's rank distribution functions, less the uniform one, with the band; those of enough draws."""
+    found = {name: by for name, by in found.items() if len(next(iter(by.values()))) >= LEAST} or found
     figure = Figure(figsize=(4.2 * min(3, len(found)), 3.4 * -(-len(found) // 3)), layout="constrained")
     axes = figure.subplots(-(-len(found) // 3), min(3, len(found)), squeeze=False, sharey=True)
     for ax in axes.ravel()[len(found) :]:
