@@ -104,8 +104,6 @@ def _section(name: str, transcription: dict[str, Any], drawn: Callable[[str, Sum
     path, kept = FOLDER / f"{name}.jsonl", kept_tables(name)
     if path.is_file():
         figures = _measured(name, read_lines(path), drawn)
-        if remark := transcription["remarks"].get(name):
-            figures.append(remark.strip() + "\n")
     elif kept is not None:
         revision, machine, tables = kept
         figures = [*(f"{table.markdown()}\n" for table in tables), f"Revision {revision}; machine: {machine}.\n"]
@@ -118,6 +116,8 @@ def _section(name: str, transcription: dict[str, Any], drawn: Callable[[str, Sum
         ]
     else:
         return ""
+    if remark := transcription["remarks"].get(name):
+        figures.append(remark.strip() + "\n")
     shown = [PAGE.parent / f"bench_{name}.png", *sorted(PAGE.parent.glob(f"bench_{name}_grid_*.png"))]
     words = what[0].splitlines()[0].rstrip(".")
     names = [words, *(path.stem.split("_grid_")[1].capitalize() for path in shown[1:])]
