@@ -12,8 +12,9 @@ from benchmarks.rivals.quick import METHODS, POSTERIOR, RivalConfig
 from benchmarks.scenes.conditions import BEHIND, SORTS
 from benchmarks.scenes.vessels import pixels_of_handle
 from benchmarks.studies.calibration import _answered_by_all, _settings, called_free, pooled_ece
-from benchmarks.studies.sbc import CONDITIONS, STATISTICS, Options, identity, main, outside, ranks_of
+from benchmarks.studies.sbc import CONDITIONS, STATISTICS, Options, drawn_from, identity, main, outside, ranks_of
 from perception.inference.settings import ControllerConfig
+from probnerf.settings import NetworkConfig
 
 
 def test_a_pooled_error_lets_objects_that_err_apart_cancel() -> None:
@@ -78,6 +79,22 @@ def test_ranks_that_are_there_are_not_made_again(tmp_path: Path) -> None:
     assert len({str(identity(c, "weights")) for c in CONDITIONS}) == len(CONDITIONS)
     with pytest.raises(ValueError, match="has no results of this prior"):
         main(Options(tmp_path, n=4, conditions="shipped prior", results=kept.path, only_chart=True))
+
+
+@pytest.mark.slow
+def test_the_networks_picture_shows_the_truth() -> None:
+    """Of most draws the network's density is nats above the prior's at the truth, and at its floor elsewhere."""
+    (condition,) = (c for c in CONDITIONS if c.name == "begun at the network, pose known")
+    model = condition.model()
+    at_truth, elsewhere = [], []
+    for seed in range(6):
+        truth, _, observation, reference = drawn_from(condition, model, seed)
+        assert reference is not None
+        at_truth.append(float(reference.over_prior(truth[None])[0]))
+        elsewhere.append(float(reference.over_prior(-truth[None])[0]))
+        assert np.asarray(observation.pose_sigma).max() == 0.0
+    assert np.median(at_truth) > 1.0
+    assert np.median(elsewhere) == pytest.approx(np.log(NetworkConfig().prior_share), abs=0.1)
 
 
 @pytest.mark.slow
