@@ -185,7 +185,8 @@ class InferConfig:
     encoder_starts: bool = True  # begin at the modes that the encoder's guesses climb to; otherwise at the prior
     network_starts: bool = True  # begin at the draws of the prior's posterior network, if it has one
     sample_delta: bool = False  # also infer the weights' perturbation delta
-    pose_tails: PoseTails = ((0.7, 0.8), (0.8, 0.8), (0.3, 1.2))  # as most objects err (`farside bench placement`)
+    # of x, y and log-scale, down and up: how fast errors grow in the tails, for some objects err by many widths
+    pose_tails: PoseTails = ((0.7, 0.8), (0.8, 0.8), (0.3, 1.2))
 
     def __post_init__(self) -> None:
         if not all(0 <= k <= 2 for pair in self.pose_tails for k in pair):
