@@ -47,7 +47,6 @@ def likelihood_settings(config: InferConfig, sample_pose: bool = True) -> Likeli
         power=config.power,
         sample_pose=sample_pose,
         sample_delta=config.sample_delta,
-        pose_tails=config.pose_tails,
     )
 
 

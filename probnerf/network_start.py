@@ -33,11 +33,10 @@ def network_used(config: InferConfig, prior: Prior) -> PosteriorNetwork | None:
 
 
 def picture_density(
-    network: PosteriorNetwork, picture: EncoderPicture, observation: Observation, likelihood: Likelihood
+    network: PosteriorNetwork, picture: EncoderPicture, observation: Observation, sample_pose: bool
 ) -> PictureDensity:
-    """The network's density for a view, over the positions of a likelihood. `picture` has the network's size."""
-    features = _features(network, picture, observation.pose_sigma, known=not likelihood.sample_pose)
-    return PictureDensity(network, features, likelihood.pose_tails)
+    """The network's density for a view. `picture` has the network's size."""
+    return PictureDensity(network, _features(network, picture, observation.pose_sigma, known=not sample_pose))
 
 
 def defensive(density: PictureDensity, config: NetworkConfig) -> DefensiveMixture:
@@ -75,4 +74,4 @@ def _features(
 
 @program("count")
 def _drawn(key: PRNGKeyArray, density: PictureDensity, *, count: int) -> tuple[Array, Array]:
-    return density.draw_with_density(key, count)
+    return density.network.draw_with_density(key, density.features, count)

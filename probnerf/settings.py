@@ -5,10 +5,6 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-# Of x, y and log-scale, below and above: how fast their errors grow in the tails (`likelihood.position.stretched`)
-PoseTails = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-NO_TAILS: PoseTails = ((0.0, 0.0), (0.0, 0.0), (0.0, 0.0))  # Gaussian
-
 
 @dataclass(frozen=True)
 class AdamConfig:
@@ -185,12 +181,8 @@ class InferConfig:
     encoder_starts: bool = True  # begin at the modes that the encoder's guesses climb to; otherwise at the prior
     network_starts: bool = True  # begin at the draws of the prior's posterior network, if it has one
     sample_delta: bool = False  # also infer the weights' perturbation delta
-    # of x, y and log-scale, down and up: how fast errors grow in the tails, for some objects err by many widths
-    pose_tails: PoseTails = ((0.7, 0.8), (0.8, 0.8), (0.3, 1.2))
 
     def __post_init__(self) -> None:
-        if not all(0 <= k <= 2 for pair in self.pose_tails for k in pair):
-            raise ValueError(f"pose_tails {self.pose_tails} must lie between 0 and 2")
         if self.lattice < 1 or not min(self.extent, self.colour_sigma, self.wall_sigma, self.power) > 0:
             raise ValueError(
                 f"lattice {self.lattice} must be 1 or more, and extent {self.extent:g}, colour_sigma"

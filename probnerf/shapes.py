@@ -8,7 +8,7 @@ from probnerf.compile_cache import program
 from probnerf.fields.base import Model
 from probnerf.likelihood.dispatch import density_at
 from probnerf.likelihood.pixel_terms import faces_of_view
-from probnerf.likelihood.position import pose_of, range_offset_of, split_position, stretched, unstretched
+from probnerf.likelihood.position import pose_of, range_offset_of, split_position
 from probnerf.likelihood.settings import Likelihood
 from probnerf.pixel_status import OBJECT, UNKNOWN
 from probnerf.rendering import foam
@@ -74,12 +74,11 @@ def poses(model: Model, likelihood: Likelihood, positions: Float[Array, "s d"], 
         zeros = jnp.zeros(positions.shape[0])
         return Pose(*[zeros] * 5)
     k = model.latent
-    return pose_of(positions[:, k : k + POSE_SIZE], pose_sigma, likelihood.pose_tails)
+    return pose_of(positions[:, k : k + POSE_SIZE], pose_sigma)
 
 
 def scaled_about(
     model: Model,
-    likelihood: Likelihood,
     positions: Float[Array, "s d"],
     pose_sigma: Float[Array, "5"],
     origin: Float[Array, "3"],
@@ -91,14 +90,11 @@ def scaled_about(
     sampled poses.
     """
     at = model.latent + 2  # of x, y, log-scale, range offset, z
-    tails = likelihood.pose_tails
-    pose = pose_of(positions[:, model.latent : model.latent + POSE_SIZE], pose_sigma, tails)
+    pose = pose_of(positions[:, model.latent : model.latent + POSE_SIZE], pose_sigma)
     foot = jnp.stack([pose.x, pose.y, BASE_Z + pose.z], axis=-1)
     shift = jnp.expm1(log_factor)[:, None] * (foot - origin)
     moved = jnp.stack([shift[:, 0], shift[:, 1], log_factor, jnp.zeros_like(log_factor), shift[:, 2]], axis=-1)
-    moved = moved / jnp.maximum(pose_sigma, 1e-9)
-    place = unstretched(stretched(positions[:, at : at + 3], tails) + moved[:, :3], tails)
-    return positions.at[:, at : at + 3].set(place).at[:, at + 3 : at + 5].add(moved[:, 3:])
+    return positions.at[:, at : at + 5].add(moved / jnp.maximum(pose_sigma, 1e-9))
 
 
 @program()

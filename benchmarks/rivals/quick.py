@@ -82,7 +82,7 @@ def answers(
     if ENCODER in methods:
         begun = time.monotonic()
         if prior.network is not None:
-            drawn = network_draws(key, vessel, prior, observation, cube, likelihood, config.hypotheses)
+            drawn = network_draws(key, vessel, prior, observation, cube, config.hypotheses)
             weights = np.full(len(drawn), 1.0 / len(drawn))
         else:
             drawn, weights = encoder_alone(key, model, likelihood, observation, picture, rivals)
@@ -90,7 +90,7 @@ def answers(
     if MAP in methods:
         begun = time.monotonic()
         if prior.network is not None:
-            starts = network_draws(key, vessel, prior, observation, cube, likelihood, rivals.yaws)
+            starts = network_draws(key, vessel, prior, observation, cube, rivals.yaws)
         else:
             starts = guesses(key, model, picture, rivals.yaws, likelihood.sample_pose)
         best, _ = map_estimate(model, likelihood, observation, starts, rivals.fit)
@@ -99,18 +99,12 @@ def answers(
 
 
 def network_draws(
-    key: Array,
-    vessel: VesselView,
-    prior: Prior,
-    observation: Observation,
-    cube: ObjectFrame,
-    likelihood: Likelihood,
-    count: int,
+    key: Array, vessel: VesselView, prior: Prior, observation: Observation, cube: ObjectFrame, count: int
 ) -> Float[Array, "count d"]:
     """Draws of the prior's posterior network."""
     assert prior.network is not None
     picture = crop(vessel.frame, vessel.segment, cube, prior.network.sizes.image_size)
-    density = picture_density(prior.network, picture, observation, likelihood)
+    density = picture_density(prior.network, picture, observation, not vessel.pose_known)
     return network_guess(key, density, count).positions
 
 

@@ -7,10 +7,6 @@ and without depth. Errors of x (towards the camera), y and log-scale are in unit
 
 - within: the width that half (90%, 99%) of the errors do not exceed; a Gaussian has 0.67 (1.64, 2.58).
 - larger, smaller: share of errors of more than two widths up, and down; a Gaussian has 2.3% each.
-- gain: mean logarithm of the prior's density at the truth, with tails (`InferConfig.pose_tails`), over that of the
-  Gaussian of the same widths, nats; paired.
-
-The tails were chosen on other objects, those of the training seeds.
 """
 
 from collections.abc import Iterator
@@ -20,15 +16,12 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from benchmarks.harness.intervals import Figures, gap_rows
+from benchmarks.harness.intervals import Figures
 from benchmarks.harness.progress import say
 from benchmarks.harness.rows import Row
 from benchmarks.harness.study import Summary, TableOptions
-from benchmarks.harness.tables import Table, gated, ranged
-from probnerf.likelihood.position import log_stretch, stretched, unstretched
+from benchmarks.harness.tables import Table
 from probnerf.objects.tabletop import VALIDATION_SEEDS
-from probnerf.settings import InferConfig
-from probnerf.types import on_device
 
 COORDINATES = ("x", "y", "log-scale")
 CONDITIONS = ("in full sight", "partly hidden", "without depth")
@@ -74,14 +67,6 @@ def _measured(n: int) -> Iterator[tuple[str, Float[np.ndarray, "m 3"]]]:
         yield condition, np.array(found)
 
 
-def gain(errors: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
-    """Logarithm of the density with tails over the Gaussian's, at these errors (in widths)."""
-    tails = InferConfig().pose_tails
-    latent = unstretched(on_device(errors), tails)
-    stretch = np.asarray(log_stretch(latent, tails), np.float64)
-    return 0.5 * (errors**2 - np.square(np.asarray(latent, np.float64))).sum(axis=1) - stretch
-
-
 def summary(errors: dict[str, Float[np.ndarray, "m 3"]]) -> Summary:
     """Figures of each condition."""
     rows: list[Row] = []
@@ -90,39 +75,28 @@ def summary(errors: dict[str, Float[np.ndarray, "m 3"]]) -> Summary:
             values = {f"within_{share:g}": float(np.quantile(np.abs(of), share)) for share in SHARES}
             values |= {"larger": float(np.mean(of > FAR)), "smaller": float(np.mean(of < -FAR))}
             rows += [Row("placement", f"{METHOD}, {name}", condition, k, v, "", len(of)) for k, v in values.items()]
-        better = gain(found)
-        rows += gap_rows("placement", METHOD, condition, "gain", better, np.zeros(len(better)))
-    of_rows, lines, gains = Figures(rows), [], []
+    figures, lines = Figures(rows), []
     for condition, found in errors.items():
         for name in COORDINATES:
-            own = [of_rows(condition, f"{METHOD}, {name}", f"within_{share:g}") for share in SHARES]
-            far = [of_rows(condition, f"{METHOD}, {name}", which) for which in ("larger", "smaller")]
+            own = [figures(condition, f"{METHOD}, {name}", f"within_{share:g}") for share in SHARES]
+            far = [figures(condition, f"{METHOD}, {name}", which) for which in ("larger", "smaller")]
             widths = [f"{value:.2f}" for value in own]
             lines.append([f"{condition} ({len(found)})", name, *widths, *(f"{value:.1%}" for value in far)])
-        over = of_rows.interval(condition, METHOD, "gain")
-        gains.append([f"{condition} ({len(found)})", gated(ranged(over, sign="+"), over.low, least=0.0)])
     header = ("condition (objects)", "error of", "half within", "90%", "99%", "2 widths up", "2 widths down")
-    tables = [
-        Table("Errors of place and size, in the widths that the prior is told", header, lines),
-        Table(
-            "The prior's density at the truth", ("condition (objects)", "tails over Gaussian, nats, gate > 0"), gains
-        ),
-    ]
-    return Summary(rows, tables, lambda: _draw(errors))
+    table = Table("Errors of place and size, in the widths that the prior is told", header, lines)
+    return Summary(rows, [table], lambda: _draw(errors))
 
 
 def _draw(errors: dict[str, Float[np.ndarray, "m 3"]]) -> Figure:
-    """The share of errors that are larger, of each coordinate, beside what both densities say."""
+    """The share of errors that are larger, of each coordinate, beside what the prior says."""
     figure = Figure(figsize=(9.6, 3.4), layout="constrained", dpi=110)
     axes = figure.subplots(1, len(COORDINATES), sharey=True)
     at = np.linspace(0.0, 8.0, 161)
-    drawn = np.random.default_rng(0).standard_normal((200_000, 3))
-    tailed = np.asarray(stretched(on_device(drawn), InferConfig().pose_tails))
+    drawn = np.random.default_rng(0).standard_normal(200_000)
     for i, (ax, name) in enumerate(zip(axes, COORDINATES, strict=True)):
         for condition, found in errors.items():
             ax.plot(at, _beyond(found[:, i], at), label=condition)
-        ax.plot(at, _beyond(tailed[:, i], at), "k-", linewidth=1, label="the prior")
-        ax.plot(at, _beyond(drawn[:, i], at), "k:", linewidth=1, label="a Gaussian")
+        ax.plot(at, _beyond(drawn, at), "k:", linewidth=1, label="the prior")
         ax.set(yscale="log", ylim=(2e-3, 1.0), xlim=(0, 8), xlabel=f"error of {name}, widths")
     axes[0].set_ylabel("share of objects that err by more")
     axes[0].legend(frameon=False, fontsize=8)

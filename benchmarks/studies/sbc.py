@@ -151,7 +151,7 @@ def statistics(
     rest = positions[:, model.latent :]
     if likelihood.sample_pose:
         pose, rest = rest[:, :POSE_SIZE], rest[:, POSE_SIZE:]
-        found["yaw"] = np.asarray(pose_of(pose, pose_sigma, likelihood.pose_tails).yaw)
+        found["yaw"] = np.asarray(pose_of(pose, pose_sigma).yaw)
     if likelihood.sample_delta:
         found["delta"] = np.mean(np.square(np.asarray(rest)), axis=1)
     return {name: np.asarray(value, np.float64) for name, value in found.items()}
@@ -224,7 +224,7 @@ def _reference(
         T_view_camera=jnp.asarray(T_object_camera, jnp.float32),
         tan_half_fov=jnp.asarray(tan_half),
     )
-    return defensive(picture_density(network, picture, observation, likelihood), NetworkConfig())
+    return defensive(picture_density(network, picture, observation, condition.pose), NetworkConfig())
 
 
 @jax.jit

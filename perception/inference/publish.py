@@ -101,7 +101,7 @@ def published(
         key = jax.random.fold_in(jax.random.key(seed), 1)
         drawn = cube.sight_sigma * jax.random.normal(key, weights.shape)
         camera = jnp.asarray(cube.to_cube(np.zeros(3)), jnp.float32)
-        positions = scaled_about(prior.model, sizeless, positions, pose_sigma, camera, drawn)
+        positions = scaled_about(prior.model, positions, pose_sigma, camera, drawn)
     scaled = view.frame.depth is not None and cube.sight_sigma > 0.0  # then measured places are not certain
     region = answered_voxels(view.frame, view.segment, cube, config.grid) | scaled
     padded, count = _padded(positions, config.hypotheses), len(weights)

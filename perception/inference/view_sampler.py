@@ -14,16 +14,7 @@ from perception.inference.limits import Limits
 from perception.inference.publish import ConditionedView
 from perception.inference.stopwatch import Stopwatch
 from perception.observation.encoder_crop import crop
-from probnerf.inference import (
-    asks_encoder,
-    crossings_of,
-    encoder_guess,
-    infer,
-    likelihood_of,
-    likelihood_settings,
-    modes_of,
-    sampler_of,
-)
+from probnerf.inference import asks_encoder, crossings_of, encoder_guess, infer, likelihood_of, modes_of, sampler_of
 from probnerf.likelihood.settings import Likelihood
 from probnerf.network_start import defensive, network_guess, network_used, picture_density, weigh_draws
 from probnerf.prior.checkpoint import Prior
@@ -103,8 +94,7 @@ class ViewSampler:
         view = self.view
         with self.stopwatch.part("network"):
             picture = crop(view.frame, view.segment, view.object_frame, network.sizes.image_size)
-            likelihood = likelihood_settings(self.config, not view.pose_known)
-            return picture_density(network, picture, view.observation, likelihood)
+            return picture_density(network, picture, view.observation, not view.pose_known)
 
     @cached_property
     def _picture(self) -> EncoderPicture | None:

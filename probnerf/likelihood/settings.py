@@ -6,7 +6,6 @@ import equinox as eqx
 
 from probnerf.fields.base import Model
 from probnerf.rendering import foam
-from probnerf.settings import NO_TAILS, PoseTails
 from probnerf.types import POSE_SIZE
 
 
@@ -25,7 +24,6 @@ class Likelihood(eqx.Module):
     sample_pose: bool = eqx.field(static=True, default=True)
     sample_delta: bool = eqx.field(static=True, default=False)
     delta_scale: float = eqx.field(static=True, default=0.025)  # sqrt(alpha)
-    pose_tails: PoseTails = eqx.field(static=True, default=NO_TAILS)  # of x, y, log-scale (`position.stretched`)
 
     def dim(self, model: Model) -> int:
         """Length of a position vector."""

@@ -20,11 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from probnerf.likelihood.position import log_stretch, stretched, unstretched
 from probnerf.prior.conditional_densities import ConditionalFlow, TripleMixture, YawMixture, zeroed
 from probnerf.prior.picture_summary import PictureSummary, affine, harmonics, turned, turned_moments
 from probnerf.prior.posterior_network import EncoderPicture
-from probnerf.settings import NO_TAILS, PoseTails
 from probnerf.types import KINDS, POSE_SIZE
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
@@ -158,6 +156,10 @@ class PosteriorNetwork(eqx.Module):
         shape = self._shape_density(features, at_yaw, pose, z_tilde)
         return features.yaw.log_density(around), mixture.log_density(pose), shape
 
+    def draw(self, key: PRNGKeyArray, features: PictureFeatures, count: int) -> Float[Array, "count d"]:
+        """Independent draws."""
+        return self.draw_with_density(key, features, count)[0]
+
     def draw_with_density(
         self, key: PRNGKeyArray, features: PictureFeatures, count: int
     ) -> tuple[Float[Array, "count d"], Float[Array, "count"]]:
@@ -219,30 +221,13 @@ class PosteriorNetwork(eqx.Module):
 class PictureDensity(eqx.Module):
     """The network's density for one picture: what a sampler needs (`probnerf.sampling.defensive_mixture`)."""
 
-    network: PosteriorNetwork  # of x, y and log-scale in perception's widths
+    network: PosteriorNetwork
     features: PictureFeatures
-    pose_tails: PoseTails = eqx.field(static=True, default=NO_TAILS)  # by which positions have them
 
     def log_density(self, position: Float[Array, "n d"]) -> Float[Array, "n"]:
         """log q(position | picture), nats."""
-        if self.features.known:
-            return self.network.log_density(self.features, position)
-        at = self._at
-        in_widths = position.at[:, at].set(stretched(position[:, at], self.pose_tails))
-        return self.network.log_density(self.features, in_widths) + log_stretch(position[:, at], self.pose_tails)
+        return self.network.log_density(self.features, position)
 
     def draw(self, key: PRNGKeyArray, count: int) -> Float[Array, "count d"]:
         """Independent draws."""
-        return self.draw_with_density(key, count)[0]
-
-    def draw_with_density(self, key: PRNGKeyArray, count: int) -> tuple[Float[Array, "count d"], Float[Array, "count"]]:
-        """Independent draws and their log-densities: cheaper than asking for the densities afterwards."""
-        drawn, log_density = self.network.draw_with_density(key, self.features, count)
-        if self.features.known:
-            return drawn, log_density
-        latent = unstretched(drawn[:, self._at], self.pose_tails)
-        return drawn.at[:, self._at].set(latent), log_density + log_stretch(latent, self.pose_tails)
-
-    @property
-    def _at(self) -> slice:
-        return slice(self.network.sizes.latent + 2, self.network.sizes.latent + 5)
+        return self.network.draw(key, self.features, count)

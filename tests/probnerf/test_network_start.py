@@ -21,8 +21,7 @@ NETWORK = shaken(CYLINDER)
 
 @pytest.mark.parametrize("sample_pose", [True, False])
 def test_a_guess_is_equal_draws_whose_density_is_known_and_nothing_else(sample_pose: bool) -> None:
-    likelihood = replace(scene("seen", True)[1], sample_pose=sample_pose, pose_tails=InferConfig().pose_tails)
-    density = picture_density(NETWORK, picture(), scene("seen", True)[2], likelihood)
+    density = picture_density(NETWORK, picture(), scene("seen", True)[2], sample_pose)
     guess = network_guess(jax.random.key(0), density, 128)
     assert guess.positions.shape == (128, CYLINDER.latent + 7 * sample_pose)
     np.testing.assert_allclose(np.exp(np.asarray(guess.log_weights)), 1 / 128, rtol=1e-5)
@@ -38,8 +37,7 @@ def test_the_network_is_used_by_tempering_unless_it_is_told_otherwise() -> None:
     assert network_used(config, prior) is NETWORK and network_used(config, without) is None
     for other in ({"network_starts": False}, {"sample_delta": True}, {"method": "annealed_hmc"}):
         assert network_used(replace(config, **other), prior) is None
-    _, likelihood, observation, _ = scene("seen", True)
-    density = picture_density(NETWORK, picture(), observation, likelihood)
+    density = picture_density(NETWORK, picture(), scene("seen", True)[2], True)
     assert sampler_of(config, defensive(density, config.network)) is config.smc_from_network
 
 
@@ -48,7 +46,7 @@ def test_the_network_is_used_by_tempering_unless_it_is_told_otherwise() -> None:
 def test_tempering_from_a_network_that_knows_nothing_is_the_posterior_by_brute_force(condition, depth) -> None:
     args = scene(condition, depth)
     grid = integrate(log_likelihood, args)
-    reference = defensive(picture_density(NETWORK, picture(), args[2], args[1]), NetworkConfig())
+    reference = defensive(picture_density(NETWORK, picture(), args[2], True), NetworkConfig())
     histograms = []
     for seed in (0, 1):
         posterior = tempered_smc(

@@ -104,7 +104,7 @@ def test_a_trained_network_is_the_exact_posterior(tmp_path: Path) -> None:
     @eqx.filter_jit
     def drawn(network, picture, sigma, key):
         seen = replace(picture, rgb=picture.rgb / 255.0, distance=picture.distance.astype(jnp.float32))
-        return network.draw_with_density(key, network.features(seen, sigma), draws)[0]
+        return network.draw(key, network.features(seen, sigma), draws)
 
     keys = jax.random.split(jax.random.key(5), count)
     x = np.asarray(jax.vmap(drawn, in_axes=(None, 0, 0, 0))(state.average, examples.picture, examples.pose_sigma, keys))
