@@ -46,18 +46,19 @@ def visible_body(
     centre, across = np.array([centre_x, centre_y]), seen[:, :2]
     reach = float(np.percentile(np.linalg.norm(across - centre, axis=1), 98))
     if reach > _PROTRUDES * max(width, height) / 2:
-        centre, width = whole_extent(across)
+        centre, width, _ = whole_extent(across)
     return centre, width, height, top_seen
 
 
-def whole_extent(across: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], float]:
-    """Middle and longest side of the smallest of the rectangles about the points (1% left out at each end)."""
+def whole_extent(across: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "2"], float, float]:
+    """Middle, longest and shorter side of the smallest of the rectangles about points (1% left out at each end)."""
     angle = np.radians(np.arange(0.0, 90.0, 5.0))
     axes = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     axes = np.stack([axes, axes[:, ::-1] * [-1.0, 1.0]], axis=1)  # [angle, axis, 2]
     low, high = np.percentile(across @ np.swapaxes(axes, 1, 2), [1, 99], axis=1)  # [angle, axis]
     best = int(np.argmin(np.prod(high - low, axis=1)))
-    return ((low + high)[best] / 2) @ axes[best], float((high - low)[best].max())
+    sides = (high - low)[best]
+    return ((low + high)[best] / 2) @ axes[best], float(sides.max()), float(sides.min())
 
 
 def _extents(

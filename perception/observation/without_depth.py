@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from calibration.camera import Camera
 from perception.observation.settings import PlaneGuess
+from perception.observation.visible_extent import whole_extent
 from perception.sources.frame import Frame
 from probnerf.pixel_status import FREE
 
@@ -19,6 +20,8 @@ from probnerf.pixel_status import FREE
 _ROUND, _ANGULAR = (0.03, 0.0, 0.0), (0.30, 0.06, 0.12)
 _NOT_ROUND = 0.07  # rms deviation of the foot's outline from an arc, of its radius; cartons: more, others: less
 _STEEPEST = 4.0  # slope of the nearest point of the foot (76 degrees), beyond which a picture shows no height
+_OUTSIDE = 0.3  # share of the mask outside of the upright body's outline, above which it lies; pitchers' handles: less
+_FLAT = 0.3  # height of what lies, of the shorter side of its outline on the plane
 _MOST = 0.5  # largest relative error of the distance that counts as a guess
 
 
@@ -92,7 +95,9 @@ def standing_body(
     d_h / h + d_tilt / slope of its distance. As the outline stays the same, the body grows by the same share: a scaling
     about the camera, which no pixel can detect. `sight_sigma` is its standard deviation.
 
-    If the foot's outline is not an arc, the body is not one of revolution: its width is visible, its depth hardly.
+    If the foot's outline is not an arc, the body is not one of revolution: its width is visible, its depth hardly. If
+    much of the mask is outside of the upright body's outline, the thing lies (a towel, a spoon), and is as large as its
+    outline is on the plane, less what its height adds behind.
     Raises `ValueError` if the foot is hidden or above the horizon, or seen too steeply or too flatly, or if the middle
     is not seen.
     """
@@ -144,8 +149,36 @@ def standing_body(
         raise ValueError(
             f"its distance would be known to {100 * sight:.0f}%: raise the camera, or give height_sigma and tilt_sigma"
         )
-    place = D * (np.cos(axis) * forward + np.sin(axis) * side) - h * up
-    return StandingBody(place, float(2.0 * D * np.sin(alpha)), max(float(height), 0.0), sight, along, across, scale)
+    width = 2.0 * D * np.sin(alpha)
+    centre = D * np.array([np.cos(axis), np.sin(axis)])
+    if np.mean(~_upright(phi, slope, h, D, 0.5 * width, height)) > _OUTSIDE:
+        centre, width, height = _lying(phi + axis, slope, h)
+        along, across, scale = _ANGULAR
+    place = centre[0] * forward + centre[1] * side - h * up
+    return StandingBody(place, float(width), max(float(height), 0.0), sight, along, across, scale)
+
+
+def _upright(
+    phi: Float[np.ndarray, "n"], slope: Float[np.ndarray, "n"], h: float, D: float, R: float, height: float
+) -> Bool[np.ndarray, "n"]:
+    """Which rays meet the upright cylinder at distance D in direction 0."""
+    half = np.sqrt(np.maximum(R**2 - (D * np.sin(phi)) ** 2, 0.0))
+    enters, leaves = h - slope * (D * np.cos(phi) - half), h - slope * (D * np.cos(phi) + half)  # heights
+    return (np.abs(D * np.sin(phi)) <= R) & (np.maximum(enters, leaves) >= 0) & (np.minimum(enters, leaves) <= height)
+
+
+def _lying(
+    phi: Float[np.ndarray, "n"], slope: Float[np.ndarray, "n"], h: float
+) -> tuple[Float[np.ndarray, "2"], float, float]:
+    """Middle (forward, side), longest side and height (m) of what lies flat where a mask's rays meet the plane."""
+    rho = h / np.maximum(slope, 0.2 * np.median(slope))
+    on_plane = rho[:, None] * np.column_stack([np.cos(phi), np.sin(phi)])
+    centre, _, shorter = whole_extent(on_plane)
+    height, away = _FLAT * shorter, centre / np.linalg.norm(centre)
+    behind = height / float(np.median(slope))  # so much of the plane its top hides
+    on_plane -= np.where(on_plane @ away > centre @ away, behind, 0.0)[:, None] * away
+    centre, longest, _ = whole_extent(on_plane)
+    return centre, longest, height
 
 
 def _ends(

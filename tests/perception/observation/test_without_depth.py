@@ -46,6 +46,38 @@ def test_a_cylinder_is_where_it_stands(thing: Cylinder, degrees: float) -> None:
     assert found.along_sigma < 0.1 or thing.radius < 0.04  # the foot is an arc, where pixels are fine enough to tell
 
 
+def outline(sides: tuple[float, float, float], yaw: float, T: np.ndarray) -> np.ndarray:
+    """The mask of a box on the table that is turned by `yaw` (degrees)."""
+    c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)]) * sides
+    corners[:, :2] = corners[:, :2] @ np.array([[c, s], [-s, c]])
+    px = CAMERA.project((corners - T[:3, 3]) @ T[:3, :3])
+    mask = np.zeros((240, 320), np.uint8)
+    cv2.fillConvexPoly(mask, cv2.convexHull(np.rint(px).astype(np.int32)), 1)
+    return mask.astype(bool)
+
+
+@pytest.mark.parametrize("sides", [(0.18, 0.03, 0.015), (0.2, 0.07, 0.02), (0.25, 0.05, 0.03)])
+@pytest.mark.parametrize("yaw", [25.0, 65.0, 130.0])
+@pytest.mark.parametrize("degrees", [30.0, 55.0])
+def test_what_lies_is_where_its_outline_meets_the_table(sides, yaw: float, degrees: float) -> None:
+    """A spoon, a bar and a stick: taken for bodies that stand, they would be a fraction as large."""
+    T = looking_down(degrees)
+    found = standing_body(CAMERA, outline(sides, yaw, T), NOTHING, true_plane(T), (0.01, np.radians(1.0)))
+    assert found.across == pytest.approx(max(sides), rel=0.25)
+    assert np.linalg.norm(found.foot - to_camera(np.zeros(3), T)) < 0.15 * max(sides)
+    assert 0.0 < found.height < 0.06 and found.along_sigma > 0.1
+
+
+def test_a_handle_does_not_lay_a_mug_down() -> None:
+    T = looking_down(35.0)
+    mug = picture(CAN, T=T).label == 1
+    handle = (picture(Cylinder(0.06, 0.0, 0.022, 0.08, base=0.02), T=T).label == 1) & ~mug
+    both = standing_body(CAMERA, mug | handle, NOTHING, true_plane(T), (0.01, np.radians(1.0)))
+    assert handle.sum() > 0.08 * mug.sum()
+    assert both.height == pytest.approx(CAN.height, rel=0.1) and both.across == pytest.approx(0.09, rel=0.1)
+
+
 def test_the_plane_comes_from_the_pose_or_from_height_and_tilt() -> None:
     T = looking_down(25.0)
     frame = replace(picture(CAN, T=T), T_world_camera=T)
