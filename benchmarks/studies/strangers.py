@@ -27,6 +27,7 @@ scores 0.693.
 """
 
 import time
+import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -34,6 +35,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import tyro
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 from tyro.conf import arg
@@ -45,7 +47,7 @@ from benchmarks.harness.rows import Row
 from benchmarks.harness.study import PriorOptions, Summary, results_of, resumed
 from benchmarks.harness.tables import Table, gated, ranged
 from benchmarks.measures.point_scores import point_scores, pooled_ece
-from benchmarks.scenes.strangers import DATA, SETS, StrangerConfig, files, hidden_points, stranger
+from benchmarks.scenes.strangers import DATA, SETS, Stranger, StrangerConfig, files, hidden_points, stranger
 from perception.answers.hypotheses import Hypotheses
 from perception.answers.query import query
 from perception.answers.regions import Points
@@ -53,13 +55,15 @@ from perception.inference.controller import estimate
 from perception.inference.hilbert_map import HilbertMapConfig, hilbert_map
 from perception.inference.settings import ControllerConfig
 from perception.observation.segmentation import Segment, segment
+from perception.simulation.sensor_draws import told_pose
 from perception.sources.frame import Frame
 from probnerf.prior.checkpoint import Prior, load_prior
 
-ALONE, QUERIED, RIVAL = ALWAYS = ("tempered_smc", "tempered_smc, as queried", "hilbert_map")
+ALONE, QUERIED, RIVAL = "tempered_smc", "tempered_smc, as queried", "hilbert_map"
 FIRST = "first answer"
-METHODS = (*ALWAYS, FIRST)
+METHODS = (ALONE, QUERIED, RIVAL, FIRST)
 DONT_KNOW = float(np.log(2.0))  # nats; what one half everywhere scores
+WITHOUT = ", without depth"  # after a set's name: the camera's pose is told instead, with an error (`told_pose`)
 BEFORE = "before"  # the method's name in rows of an older file
 AIMS = {"balanced": 0.5, "ece": 0.08, "free_occupied": 0.05, "free": 0.15, "out_of_model": 0.20}
 SCORES = ("log_score", "balanced", "ece")
@@ -74,6 +78,8 @@ class Options(PriorOptions):
     which are no strangers to a prior that learnt it."""
     n: int = 100
     """Objects of each set at most."""
+    without_depth: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Drop the depth, and tell the camera's pose with an error. The map without shapes has no answer then."""
     stages: int = 60
     """Stages that the sampler may take."""
     budget_s: float = 0.0
@@ -102,13 +108,13 @@ def _measure(options: Options, prior: Prior, results: Results) -> None:
     limit = {"budget_s": options.budget_s} if options.budget_s else {"stages": options.stages}
     ours = {"digest": digest([asdict(config), asdict(scene)], options.quick), **limit}
     rival = {"digest": digest([asdict(map_config), asdict(scene)], options.quick)}
-    settings = {ALONE: ours, QUERIED: ours, RIVAL: rival}
+    settings = {ALONE: ours, QUERIED: ours} | ({} if options.without_depth else {RIVAL: rival})
     if prior.network is not None:
         settings[FIRST] = ours
-    names = ["gso", "bullet"] if options.set == "both" else [options.set]
-    for name in names:
+    for name in ["gso", "bullet"] if options.set == "both" else [options.set]:
         for path in files(SETS[name], options.data, options.n):
-            common = {"prior": prior.identity, "condition": SETS[name], "object": path.stem, "seed": options.seed}
+            condition = SETS[name] + WITHOUT * options.without_depth
+            common = {"prior": prior.identity, "condition": condition, "object": path.stem, "seed": options.seed}
             lines = {method: {**common, "method": method, "settings": own} for method, own in settings.items()}
             if all(line in results for line in lines.values()):
                 continue
@@ -128,20 +134,29 @@ def _answers(
     """What is kept of each method's answer to one object; `refused` where perception does not take it."""
     seen = stranger(path, scene)
     points, occupied = hidden_points(seen, scene)
+    ours = (QUERIED, ALONE) if prior.network is None else (QUERIED, ALONE, FIRST)
     try:
         if not len(points):
             raise ValueError("no point about it is hidden")
-        found = segment(seen.frame, 1)[0]
+        frame = _blind(seen) if options.without_depth else seen.frame
+        found = segment(frame, 1)[0]
     except ValueError as error:
-        return {method: {"refused": str(error)} for method in (*ALWAYS, *_network_methods(prior))}
-    begun = time.monotonic()
-    smooth = hilbert_map(seen.frame, found, map_config).p_occupied(points)
-    seconds = round(time.monotonic() - begun, 2)
+        return {m: {"refused": str(error)} for m in (ours if options.without_depth else (*ours, RIVAL))}
+    answered: dict[str, dict[str, Any]] = {}
+    if not options.without_depth:
+        begun = time.monotonic()
+        smooth = hilbert_map(frame, found, map_config).p_occupied(points)
+        answered[RIVAL] = {**_told(smooth, occupied), "seconds": round(time.monotonic() - begun, 2)}
     try:
-        answered = _of_perception(seen.frame, found, points, occupied, prior, config, options)
+        return answered | _of_perception(frame, found, points, occupied, prior, config, options)
     except ValueError as error:
-        answered = {method: {"refused": str(error)} for method in (QUERIED, ALONE, *_network_methods(prior))}
-    return {**answered, RIVAL: {**_told(smooth, occupied), "seconds": seconds}}
+        return answered | {method: {"refused": str(error)} for method in ours}
+
+
+def _blind(seen: Stranger) -> Frame:
+    """The frame without depth, and with the camera's pose over the table as a user might tell it."""
+    told = told_pose(seen.T_world_camera, np.random.default_rng([zlib.crc32(seen.name.encode()), 71]))
+    return replace(seen.frame, depth=None, T_world_camera=told)
 
 
 def _of_perception(
@@ -190,10 +205,6 @@ def _of_perception(
     return told
 
 
-def _network_methods(prior: Prior) -> tuple[str, ...]:
-    return () if prior.network is None else (FIRST,)
-
-
 def _asked(h: Hypotheses, points: Float[np.ndarray, "n 3"], occupied: Bool[np.ndarray, "n"]) -> dict[str, Any]:
     return _told(np.array(query([h], Points(points), "camera", now_ns=h.stamp_ns).p_occupied_few), occupied)
 
@@ -211,7 +222,7 @@ def summary(lines: list[Line], options: Options) -> Summary | None:
     if older:
         older = [line for line in newest(older, older[-1]["prior"]) if line["method"] == ALONE]
     rows: list[Row] = []
-    for condition in SETS.values():
+    for condition in (name + suffix for suffix in ("", WITHOUT) for name in SETS.values()):
         of = {method: _by_object(lines, method, condition) for method in METHODS}
         if not of[ALONE]:
             continue
@@ -221,7 +232,8 @@ def summary(lines: list[Line], options: Options) -> Summary | None:
         rows += _gaps(condition, of)
         refused = sum(line["condition"] == condition and line["method"] == ALONE for line in lines) - len(of[ALONE])
         rows.append(Row("strangers", ALONE, condition, "refused", float(refused), "", len(of[ALONE]) + refused))
-    return Summary(rows, _tables(Figures(rows)), lambda: _draw(lines)) if rows else None
+    tables = [_score_table(figures := Figures(rows)), _gap_table(figures)]
+    return Summary(rows, tables, lambda: _draw(lines)) if rows else None
 
 
 def _by_object(lines: Sequence[Line], method: str, condition: str) -> dict[str, Line]:
@@ -274,10 +286,6 @@ def _gaps(condition: str, of: dict[str, dict[str, Line]]) -> list[Row]:
             rows += gap_rows("strangers", ALONE, condition, f"balanced_over_{other}", a, b)
             rows.append(Row("strangers", ALONE, condition, f"better_than_{other}", float(np.mean(a < b)), "", len(a)))
     return rows
-
-
-def _tables(of: Figures) -> list[Table]:
-    return [_score_table(of), _gap_table(of)]
 
 
 def _score_table(of: Figures) -> Table:
