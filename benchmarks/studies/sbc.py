@@ -21,8 +21,6 @@ truth from where the pixels were seen, as clean as a camera's (`CLEAN`). Where t
 begins at the mixture's share of the prior. *Moved longer*: with six times the stages at beta = 1. *As it ships*: with
 as few particles and moves as an answer has.
 
-The tabletop prior's rows fail. Of the prior that is shipped now there are few draws yet.
-
 outside: how far the ranks' distribution function leaves the band that holds 95% of uniform samples as a whole
 (`metrics.uniform_band`); 0 if it stays inside. coverage90: share of truths in the central 90%.
 """
