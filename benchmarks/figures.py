@@ -62,7 +62,7 @@ these changes moved answers:
 - 3970cc1 (2026-11-28): the shipped prior's decoder learnt on at points of others. Before, the prior was 3705a6d9.
 - 8919b3d (2026-11-29): each population compares its own choice of pixels, and one run is made; before, up to four of
   the same pixels. What is not explained is asked of all of them.
-- 7616f74 (2026-11-29): without depth, what lies is placed by its outline on the table.
+- 20ef09c (2026-11-29): without depth, what lies is placed by its outline on the table.
 """
 
 
