@@ -67,7 +67,7 @@ from probnerf.types import POSE_SIZE, Observation, Posterior, Rays
 GRID = 24
 POSE_SIGMA = (0.08, 0.08, 0.06, 0.02, 0.03)  # of perception's usual widths, cube units
 STATISTICS = ("volume", "hidden", "voxel", "yaw", "delta", "log_likelihood")
-# the network's picture, which has a camera's noise instead of the likelihood's: in that it missed 4 truths of 8
+# of the network's picture: a camera's noise, with which it has learnt, instead of the likelihood's
 CLEAN = (0.02, 0.0, 0.0, 0.01)  # colour_sigma, outlier, mask_error, wall_sigma
 TABLE = 0.6  # colour of the table in the network's picture
 LEAST = 50  # draws, without which a band says nothing
@@ -166,12 +166,8 @@ def drawn_from(
     drawn = likelihood_settings(_settings(condition), condition.pose)
     truth = jax.random.normal(jax.random.fold_in(key, 0), (drawn.dim(model),))
     observation = draw_pixels(jax.random.fold_in(key, 1), model, drawn, truth, rays, every, yes, pose_sigma=pose_sigma)
-    return (
-        truth,
-        drawn,
-        observation,
-        _reference(condition, jax.random.fold_in(key, 3), model, drawn, truth, observation),
-    )
+    reference = _reference(condition, jax.random.fold_in(key, 3), model, drawn, truth, observation)
+    return truth, drawn, observation, reference
 
 
 def ranks_of(condition: Condition, model: Model, seed: int) -> tuple[dict[str, float], Posterior]:

@@ -21,8 +21,8 @@ from probnerf.pixel_status import FREE
 _ROUND, _ANGULAR = (0.03, 0.0, 0.0), (0.30, 0.06, 0.12)
 _NOT_ROUND = 0.07  # rms deviation of the foot's outline from an arc, of its radius; cartons: more, others: less
 _STEEPEST = 4.0  # slope of the nearest point of the foot (76 degrees), beyond which a picture shows no height
-# Share of the mask outside of the upright body's outline, and with it that of the outline which the mask does not fill,
-# above which a thing lies. Of 100 vessels and cartons (validation): at most 0.29 and 0.40.
+# Share of the mask outside of the upright body's outline, and the same plus the share of the outline that the mask does
+# not fill, above which a thing lies. From validation objects: vessels with their handles, and cartons, have less.
 _OUTSIDE, _UNLIKE = 0.30, 0.42
 _AROUND = 6  # px about the mask in which the outline is compared
 _FLAT = 0.3  # height of what lies, of the shorter side of its outline on the plane
@@ -100,8 +100,8 @@ def standing_body(
     about the camera, which no pixel can detect. `sight_sigma` is its standard deviation.
 
     If the foot's outline is not an arc, the body is not one of revolution: its width is visible, its depth hardly. If
-    much of the mask is outside of the upright body's outline, the thing lies (a towel, a spoon), and is as large as its
-    outline is on the plane, less what its height adds behind.
+    the mask is below the horizon and unlike the upright body's outline (`_lies`), the thing lies, and is as large as
+    its own outline is on the plane, less what its height adds behind.
     Raises `ValueError` if the foot is hidden or above the horizon, or seen too steeply or too flatly, or if the middle
     is not seen.
     """
@@ -155,7 +155,7 @@ def standing_body(
         )
     width = 2.0 * D * np.sin(alpha)
     centre = D * np.array([np.cos(axis), np.sin(axis)])
-    if _lies(camera, mask, hidden, plane, forward, axis, (D, 0.5 * width, max(height, 0.0))):
+    if top > 0 and _lies(camera, mask, hidden, plane, forward, axis, (D, 0.5 * width, max(height, 0.0))):
         centre, width, height = _lying(phi + axis, slope, h)
         along, across, scale = _ANGULAR
     place = centre[0] * forward + centre[1] * side - h * up

@@ -78,6 +78,15 @@ def test_a_handle_does_not_lay_a_mug_down() -> None:
     assert both.height == pytest.approx(CAN.height, rel=0.1) and both.across == pytest.approx(0.09, rel=0.1)
 
 
+def test_what_reaches_over_the_horizon_does_not_lie() -> None:
+    """A desk lamp: a thin foot, and a shade to its side above the camera, whose rays meet no table."""
+    T = looking_down(8.0, 0.6)
+    foot, shade = Cylinder(0.0, 0.0, 0.02, 0.25), Cylinder(0.15, 0.0, 0.08, 0.12, base=0.15)
+    mask = (picture(foot, T=T).label == 1) | (picture(shade, T=T).label == 1)
+    found = standing_body(CAMERA, mask, NOTHING, true_plane(T), (0.01, np.radians(1.0)))
+    assert found.across < 0.4 and found.height == pytest.approx(0.25, rel=0.1)
+
+
 def test_the_plane_comes_from_the_pose_or_from_height_and_tilt() -> None:
     T = looking_down(25.0)
     frame = replace(picture(CAN, T=T), T_world_camera=T)
